@@ -1,0 +1,313 @@
+"""Claims about recording.
+
+1.  Killed at any system call, even in the middle of a write, a collection loses at most the episode being
+    written; what remains opens, is intact, and running the collection again ends in the very bytes of an
+    unbroken run.
+2.  The same holds for kills at random moments, over and over.
+3.  A full disk leaves every committed episode, and the writer itself can go on once there is space.
+4.  Two writers never append at once.
+5.  A dataset is only ever continued with the settings it was begun with; the target alone may grow.
+6.  A torn tail is cut off; real damage is never "repaired" by throwing episodes away.
+7.  The index line of an episode is written after its rows are on disk, which is what a power failure asks for.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import multiprocessing
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, estimate_bytes
+
+FILES = ("meta.json", "episodes.jsonl", "pixels.memmap", "action.memmap", "state.memmap")
+SYSTEM_CALLS = ("write", "fsync", "replace", "ftruncate")
+fork = multiprocessing.get_context("fork")  # the child inherits the imports: milliseconds instead of seconds
+
+
+def content(path):
+    return {name: (path / name).read_bytes() for name in FILES}
+
+
+@pytest.fixture
+def collect(make_episode, meta):
+    """A collection in which episode k depends on k alone, as a real one depends on (seed, k)."""
+
+    def collect(path, target=4, pause=0.0):
+        with EpisodeWriter(path, target_episodes=target, meta=meta) as writer:
+            for number in range(writer.num_episodes + 1, target + 1):
+                writer.append(make_episode(number, length=10 + number))
+                time.sleep(pause)
+            writer.finish()
+
+    return collect
+
+
+def run_killed(target, *args):
+    """Runs a function in a child process and returns its exit code (-9 when it was killed)."""
+    process = fork.Process(target=target, args=args)
+    process.start()
+    process.join(30)
+    return process.exitcode
+
+
+def kill_at(call, function, *args):
+    """Runs a function in this process and dies at the ``call``-th system call, half-way through if it is a write."""
+    count = 0
+    originals = {name: getattr(os, name) for name in SYSTEM_CALLS}
+
+    def wrap(name):
+        def wrapped(*arguments):
+            nonlocal count
+            count += 1
+            if count == call:
+                if name == "write":
+                    descriptor, data = arguments
+                    originals["write"](descriptor, data[: len(data) // 2])
+                os.kill(os.getpid(), signal.SIGKILL)
+            return originals[name](*arguments)
+
+        return wrapped
+
+    for name in SYSTEM_CALLS:
+        setattr(os, name, wrap(name))
+    function(*args)
+    os._exit(0)
+
+
+def check_prefix(path, make_episode):
+    """What is there opens, with checksums, and is a prefix of the collection. Returns the number of episodes."""
+    try:
+        store = EpisodeStore.open(path, allow_incomplete=True, verify="full")
+    except FileNotFoundError:
+        return 0
+    except ValueError as error:
+        assert "holds 0 of" in str(error)
+        return 0
+    for number in range(1, store.num_episodes + 1):
+        want = make_episode(number, length=10 + number)
+        for key, array in store.arrays.items():
+            np.testing.assert_array_equal(array[store.rows(number)], want[key])
+    return store.num_episodes
+
+
+def test_a_kill_at_any_system_call_loses_at_most_the_current_episode(tmp_path, collect, make_episode):
+    collect(tmp_path / "unbroken")
+    unbroken = content(tmp_path / "unbroken")
+    survived = []
+    for call in range(1, 200):
+        path = tmp_path / f"killed_{call}"
+        exit_code = run_killed(kill_at, call, collect, path)
+        survived.append(check_prefix(path, make_episode))
+        collect(path)
+        assert content(path) == unbroken, f"killed at system call {call}"
+        if exit_code == 0:
+            break
+    assert exit_code == 0 and call > 4 * 8  # each episode has 4 writes and 4 fsyncs
+    assert survived == sorted(survived) and set(survived) == {0, 1, 2, 3, 4}
+
+
+def test_a_kill_while_resuming_is_harmless_too(tmp_path, collect, make_episode):
+    collect(tmp_path / "unbroken")
+    path = tmp_path / "killed"
+    attempts, before = 0, 0
+    while run_killed(kill_at, 13, collect, path):  # far enough to commit one episode at a time, or to die resuming
+        episodes = check_prefix(path, make_episode)
+        assert episodes >= before
+        before, attempts = episodes, attempts + 1
+        assert attempts < 20
+    assert attempts >= 3
+    assert content(path) == content(tmp_path / "unbroken")
+
+
+def test_random_kills_never_break_or_duplicate(tmp_path, collect, make_episode):
+    collect(tmp_path / "unbroken", 60)
+    path = tmp_path / "killed"
+    random = np.random.default_rng(0)
+    before = 0
+    for _ in range(8):
+        process = fork.Process(target=collect, args=(path, 60, 0.001))
+        process.start()
+        time.sleep(random.uniform(0.01, 0.06))
+        os.kill(process.pid, signal.SIGKILL)
+        process.join(30)
+        episodes = check_prefix(path, make_episode)
+        assert episodes >= before
+        before = episodes
+    collect(path, 60)
+    assert content(path) == content(tmp_path / "unbroken")
+
+
+@pytest.mark.parametrize("call", range(1, 9))
+def test_a_full_disk_leaves_the_committed_episodes(tmp_path, collect, make_episode, meta, monkeypatch, call):
+    collect(tmp_path / "unbroken", 3)
+    write, count = os.write, 0
+
+    def full(descriptor, data):
+        nonlocal count
+        count += 1
+        if count == call:
+            write(descriptor, data[: len(data) // 2])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(descriptor, data)
+
+    path = tmp_path / "full"
+    monkeypatch.setattr(os, "write", full)
+    with EpisodeWriter(path, target_episodes=3, meta=meta) as writer:
+        while not writer.complete:
+            episode = make_episode(writer.num_episodes + 1, length=11 + writer.num_episodes)
+            try:
+                writer.append(episode)
+            except OSError as error:
+                assert error.errno == errno.ENOSPC
+                assert check_prefix(path, make_episode) == writer.num_episodes
+    assert count > call
+    assert content(path) == content(tmp_path / "unbroken")
+
+
+def test_rows_are_on_disk_before_their_index_line_is_written(tmp_path, make_episode, meta, monkeypatch):
+    with EpisodeWriter(tmp_path, target_episodes=2, meta=meta) as writer:
+        writer.append(make_episode(1))
+        names = {(tmp_path / name).stat().st_ino: name for name in FILES}
+        log = []
+        for call in ("write", "fsync"):
+            original = getattr(os, call)
+
+            def logged(descriptor, *data, call=call, original=original):
+                log.append((call, names[os.fstat(descriptor).st_ino]))
+                return original(descriptor, *data)
+
+            monkeypatch.setattr(os, call, logged)
+        writer.append(make_episode(2))
+    data = [name for name in FILES if name.endswith(".memmap")]
+    assert sorted(log[:3]) == sorted(("write", name) for name in data)
+    assert sorted(log[3:6]) == sorted(("fsync", name) for name in data)
+    assert log[6:] == [("write", "episodes.jsonl"), ("fsync", "episodes.jsonl")]
+
+
+def test_a_second_writer_is_refused_until_the_first_is_gone(tmp_path, make_episode, meta):
+    first = EpisodeWriter(tmp_path, target_episodes=2, meta=meta)
+    first.append(make_episode(1))
+    with pytest.raises(RuntimeError, match="another writer has .* open"):
+        EpisodeWriter(tmp_path, target_episodes=2, meta=meta)
+    first.append(make_episode(2))  # the refused one has cut nothing off
+    first.close()
+    with EpisodeWriter(tmp_path, target_episodes=2, meta=meta) as second:
+        assert second.complete and second.num_steps == 40
+
+
+@pytest.mark.parametrize(
+    "change, field",
+    [({"seed": 1}, "seed = 0, got 1"), ({"env_kwargs": {"noise": 2.0}}, "env_kwargs"), ({"expert": "x"}, "expert")],
+)
+def test_other_settings_are_refused_by_name(record, meta, change, field):
+    path = record([20])
+    before = content(path)
+    with pytest.raises(ValueError, match=field):
+        EpisodeWriter(path, target_episodes=1, meta={**meta, **change})
+    assert content(path) == before
+
+
+def test_only_the_target_may_grow(record, make_episode, meta):
+    path = record([20, 20])
+    with pytest.raises(ValueError, match="target may only grow"):
+        EpisodeWriter(path, target_episodes=1, meta=meta)
+    with EpisodeWriter(path, target_episodes=3, meta=meta) as writer:
+        assert writer.num_episodes == 2 and not writer.complete
+        assert writer.append(make_episode(3)) == 3
+    assert EpisodeStore.open(path).num_episodes == 3
+
+
+def test_meta_survives_json(tmp_path, make_episode):
+    meta = {"action_low": np.array([-1.0, -np.inf]), "size": (4, 4), "seed": np.int64(3), "path": tmp_path}
+    for _ in range(2):  # the second one compares with what the first one wrote
+        with EpisodeWriter(tmp_path / "d", target_episodes=1, meta=meta) as writer:
+            writer.complete or writer.append(make_episode(1))
+    header = EpisodeStore.open(tmp_path / "d").header
+    assert header.meta == {"action_low": [-1.0, -np.inf], "size": [4, 4], "seed": 3, "path": str(tmp_path)}
+    with pytest.raises(TypeError, match="got a object"):
+        EpisodeWriter(tmp_path / "e", target_episodes=1, meta={"expert": object()})
+
+
+@pytest.mark.parametrize("tail", [b'{"episode": 3, "start"', b"\x00" * 50, b'{"episode": 3}'])
+def test_a_torn_tail_is_cut_off(record, make_episode, meta, tail):
+    path = record([20, 21], target=3)
+    whole = content(path)
+    for name, junk in [("episodes.jsonl", tail), ("pixels.memmap", b"half a frame"), ("state.memmap", b"123")]:
+        with open(path / name, "ab") as file:
+            file.write(junk)
+    assert EpisodeStore.open(path, allow_incomplete=True, verify="full").num_episodes == 2
+    with EpisodeWriter(path, target_episodes=3, meta=meta) as writer:
+        assert (writer.num_episodes, writer.num_steps) == (2, 41)
+        assert content(path) == whole
+
+
+def test_a_writer_does_not_repair_damage_by_losing_episodes(record, meta):
+    path = record([20, 20])
+    pixels = (path / "pixels.memmap").read_bytes()
+    (path / "pixels.memmap").write_bytes(pixels[:-1])
+    before = content(path)
+    with pytest.raises(ValueError, match="pixels.memmap is damaged: 1919 bytes, the index needs 1920"):
+        EpisodeWriter(path, target_episodes=2, meta=meta)
+    assert content(path) == before
+    (path / "meta.json").unlink()
+    with pytest.raises(ValueError, match="index but no meta.json"):
+        EpisodeWriter(path, target_episodes=2, meta=meta)
+    assert (path / "action.memmap").stat().st_size
+
+
+def test_what_cannot_be_recorded_is_refused_and_leaves_no_trace(tmp_path, make_episode, meta):
+    good = make_episode(1)
+    with EpisodeWriter(tmp_path, target_episodes=2, meta=meta) as writer:
+        with pytest.raises(ValueError, match="NaN"):
+            writer.append({**good, "state": np.full((20, 2), np.nan)})
+        with pytest.raises(ValueError, match="'state' must hold at least one number"):
+            writer.append({**good, "state": np.zeros((20, 0))})
+        with pytest.raises(TypeError, match="'state' must be a numpy array, got a list"):
+            writer.append({**good, "state": good["state"].tolist()})
+        with pytest.raises(ValueError, match="action must be zero"):
+            writer.append({**good, "action": np.ones((20, 3), np.float32)})
+        writer.append(good)
+        with pytest.raises(ValueError, match="row shapes must stay"):
+            writer.append(make_episode(2, size=8))
+        with pytest.raises(RuntimeError, match="1 of 2 episodes"):
+            writer.finish()
+        with pytest.raises(RuntimeError, match="closed"):
+            writer.append(good)
+    with EpisodeWriter(tmp_path, target_episodes=2, meta=meta) as writer:
+        writer.append(make_episode(2))
+        with pytest.raises(RuntimeError, match="holds its 2 episodes"):
+            writer.append(make_episode(3))
+    with pytest.raises(FileExistsError, match="already holds a dataset"):
+        EpisodeWriter(tmp_path, target_episodes=2, meta=meta, resume=False)
+    with pytest.raises(ValueError, match="at least 1"):
+        EpisodeWriter(tmp_path / "x", target_episodes=0, meta=meta)
+
+
+def test_non_contiguous_arrays_are_stored_as_they_read(tmp_path, make_episode, meta):
+    episode = make_episode(1)
+    strided = {**episode, "pixels": np.ascontiguousarray(episode["pixels"].transpose(0, 2, 3, 1)).transpose(0, 3, 1, 2)}
+    with EpisodeWriter(tmp_path, target_episodes=1, meta=meta) as writer:
+        writer.append(strided)
+    np.testing.assert_array_equal(EpisodeStore.open(tmp_path, verify="full").arrays["pixels"], episode["pixels"])
+
+
+def test_the_size_estimate_is_exact(record):
+    path = record([20, 30])
+    size = sum((path / f"{key}.memmap").stat().st_size for key in ("pixels", "action", "state"))
+    assert estimate_bytes(50, 4, action_dim=3, state_dim=2) == size == estimate_bytes(50, (4, 4), 3, 2)
+
+
+def test_the_index_is_one_plain_json_line_per_episode(record):
+    lines = (record([20, 30]) / "episodes.jsonl").read_text().splitlines()
+    entries = [json.loads(line) for line in lines]
+    assert [(entry["episode"], entry["start"], entry["length"]) for entry in entries] == [(1, 0, 20), (2, 20, 30)]
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])

@@ -1,0 +1,297 @@
+"""Claims about the dataset as a whole.
+
+1.  A run resumes at the exact batch, with and without prefetching, in the same process and in another one.
+2.  Z-scores come from training episodes only, whichever split is served.
+3.  It behaves as a TorchRL dataset: ``load_dataset``, refusal to extend, transforms, a small state dict.
+4.  It arrives in a spawned worker without its data being copied.
+5.  Importing it pulls in no simulator and no file-format library.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from torchrl.checkpoint import Checkpoint
+from torchrl.data.datasets import load_dataset
+
+from torchrl_ficreg.data import (
+    ActionStatistics,
+    ClipStorage,
+    EpisodeStore,
+    OfflineTrajectories,
+    SeekableReplayBuffer,
+    split_episodes,
+)
+
+LENGTHS = [20 + number % 7 for number in range(30)]
+
+
+@pytest.fixture(scope="module")
+def path(record):
+    return record(LENGTHS)
+
+
+def indices(dataset, count):
+    return [dataset.sample()["index"][:, 0].tolist() for _ in range(count)]
+
+
+def test_a_batch_has_the_contracted_shapes(path):
+    batch = OfflineTrajectories(path, batch_size=8, keys=("pixels", "action", "state", "episode", "step")).sample()
+    assert batch.batch_size == (8, 4)
+    shapes = {key: (tuple(value.shape), value.dtype) for key, value in batch.items()}
+    assert shapes == {
+        "pixels": ((8, 4, 3, 4, 4), torch.uint8),
+        "action": ((8, 4, 15), torch.float32),
+        "mask": ((8, 4), torch.bool),
+        "state": ((8, 4, 2), torch.float64),
+        "episode": ((8, 4), torch.int64),
+        "step": ((8, 4), torch.int64),
+        "index": ((8, 4), torch.int64),
+    }
+    assert OfflineTrajectories(path, num_frames=2, frame_skip=3).sample(5)["action"].shape == (5, 2, 9)
+
+
+@pytest.mark.parametrize("prefetch", [None, 1, 3])
+def test_iterating_yields_exact_epochs(path, prefetch):
+    dataset = OfflineTrajectories(path, batch_size=7, prefetch=prefetch, drop_last=False)
+    for _ in range(3):
+        order = torch.cat([batch["index"][:, 0] for batch in dataset]).tolist()
+        assert sorted(order) == list(range(dataset.num_clips))
+    for batch in dataset:
+        break
+    assert sum(1 for _ in dataset) == dataset.batches_per_epoch - 1  # what is left of it
+    assert dataset.batches == 4 * dataset.batches_per_epoch
+
+
+@pytest.mark.parametrize("saving", [None, 1, 4])
+@pytest.mark.parametrize("resuming", [None, 1, 4])
+def test_a_run_resumes_at_the_exact_batch(path, saving, resuming):
+    unbroken = indices(OfflineTrajectories(path, batch_size=7, seed=5), 60)
+    dataset = OfflineTrajectories(path, batch_size=7, seed=5, prefetch=saving)
+    assert indices(dataset, 25) == unbroken[:25]
+    state = dataset.state_dict()
+    indices(dataset, 3)  # going on does not change what was saved
+    resumed = OfflineTrajectories(path, batch_size=7, seed=77, prefetch=resuming)
+    indices(resumed, 2)  # nor does what was prefetched before loading leak in
+    resumed.load_state_dict(state)
+    assert resumed.batches == 25
+    assert indices(resumed, 35) == unbroken[25:]
+    resumed.seek(11)
+    assert indices(resumed, 5) == unbroken[11:16]
+
+
+def test_prefetched_clips_are_the_same_clips(path):
+    plain, prefetched = (OfflineTrajectories(path, batch_size=7, prefetch=prefetch) for prefetch in (None, 2))
+    for _ in range(40):
+        assert (plain.sample() == prefetched.sample()).all()
+
+
+def test_checkpoints_hold_the_position_and_not_the_data(path, tmp_path):
+    dataset = OfflineTrajectories(path, batch_size=7, prefetch=2)
+    indices(dataset, 9)
+    assert len(pickle.dumps(dataset.state_dict())) < 300
+    dataset.dumps(tmp_path / "own")
+    Checkpoint(data=dataset).save(tmp_path / "torchrl")
+    assert sum(file.stat().st_size for file in (tmp_path / "torchrl").rglob("*") if file.is_file()) < 20_000
+    expected = indices(dataset, 4)
+    for load in (
+        lambda fresh: fresh.loads(tmp_path / "own"),
+        lambda fresh: Checkpoint(data=fresh).load(tmp_path / "torchrl"),
+    ):
+        fresh = OfflineTrajectories(path, batch_size=7, prefetch=2)
+        load(fresh)
+        assert indices(fresh, 4) == expected
+
+
+def test_a_position_of_another_dataset_is_refused(path):
+    dataset = OfflineTrajectories(path, batch_size=7)
+    dataset.sample()
+    with pytest.raises(ValueError, match="in batches of 7, here are .* in batches of 8"):
+        OfflineTrajectories(path, batch_size=8).load_state_dict(dataset.state_dict())
+    with pytest.raises(ValueError, match="saved for"):
+        OfflineTrajectories(path, batch_size=7, split="all").load_state_dict(dataset.state_dict())
+
+
+def test_statistics_come_from_training_episodes_only(path, make_episode):
+    train = split_episodes(30, "train")
+    actions = np.concatenate([make_episode(e, LENGTHS[e - 1])["action"][:-1] for e in train])  # not the last rows
+    for split in ("train", "validation", "evaluation", "all"):
+        dataset = OfflineTrajectories(path, split=split, batch_size=7)
+        np.testing.assert_allclose(dataset.statistics.mean, actions.mean(0, dtype=float), rtol=1e-6)
+        np.testing.assert_allclose(dataset.statistics.std, actions.std(0, dtype=float), rtol=1e-6)
+        batch = dataset.sample()
+        raw = ClipStorage(dataset._store, dataset.episodes["episode"], num_frames=4, frame_skip=5)[batch["index"][:, 0]]
+        expected = torch.where(batch["mask"][..., None], dataset.statistics.normalize(raw["action"]), torch.zeros(()))
+        assert batch["action"].equal(expected)
+
+
+def test_given_statistics_are_used(path):
+    identity = ActionStatistics(torch.zeros(3), torch.ones(3))
+    batch = OfflineTrajectories(path, batch_size=7, statistics=identity, keys=("action", "step")).sample()
+    assert batch["action"][:, 0, 1].equal(batch["step"][:, 0].float())
+    with pytest.raises(ValueError, match="describe 2 action dimensions, the dataset has 3"):
+        OfflineTrajectories(path, statistics=ActionStatistics(torch.zeros(2), torch.ones(2)))
+
+
+def test_splits_can_share_one_mapping(path):
+    store = EpisodeStore.open(path)
+    train, validation = (OfflineTrajectories(store, split=split, batch_size=7) for split in ("train", "validation"))
+    assert train._store is validation._store and train.data_path == path
+    assert indices(train, 3) == indices(OfflineTrajectories(path, batch_size=7), 3)
+
+
+def test_splits_share_no_episode(path):
+    served = {}
+    for split in ("train", "validation", "evaluation"):
+        dataset = OfflineTrajectories(path, split=split, batch_size=1, keys=("episode",))
+        served[split] = {episode for batch in dataset for episode in batch["episode"].flatten().tolist()}
+        assert served[split] == set(dataset.episodes["episode"].tolist())
+    assert set.union(*served.values()) == set(range(1, 31)) and sum(map(len, served.values())) == 30
+
+
+def test_rows_and_whole_episodes(path, make_episode):
+    dataset = OfflineTrajectories(path, split="evaluation", batch_size=1)
+    assert dataset.num_steps == sum(dataset.episodes["length"].tolist())
+    assert dataset.num_clips == sum(length - 15 for length in dataset.episodes["length"].tolist()) == len(dataset)
+    for number, start, length in zip(*(dataset.episodes[key].tolist() for key in ("episode", "start", "length"))):
+        assert dataset.row(number, 3) == start + 3
+        data, want = dataset.episode_data(number), make_episode(number, LENGTHS[number - 1])
+        assert data.shape == (length,)
+        for key, value in want.items():
+            np.testing.assert_array_equal(data[key], value)
+        assert data["next", "done"].squeeze(-1).nonzero().tolist() == [[length - 1]]
+        assert data["step"].tolist() == list(range(length)) and set(data["episode"].tolist()) == {number}
+        with pytest.raises(IndexError, match=f"steps 0 to {length - 1}, got {length}"):
+            dataset.row(number, length)
+    absent = OfflineTrajectories(path).episodes["episode"][0].item()
+    for ask in (dataset.episode_data, lambda episode: dataset.row(episode, 0)):
+        with pytest.raises(KeyError, match=f"'evaluation' split has no episode {absent}"):
+            ask(absent)
+
+
+def test_it_is_read_only(path):
+    before = {file.name: file.read_bytes() for file in path.iterdir()}
+    dataset = OfflineTrajectories(path, batch_size=7)
+    with pytest.raises(RuntimeError, match="doesn't allow writing"):
+        dataset.extend(dataset[:2])
+    with pytest.raises(RuntimeError, match="cannot be changed"):
+        dataset[0] = dataset[1]
+    with pytest.raises(RuntimeError):
+        dataset.empty()
+    with pytest.raises(RuntimeError, match="pass transform="):
+        dataset.preprocess(lambda data: data, dest=path)
+    dataset.sample().zero_()
+    dataset.episode_data(1).zero_()
+    dataset.meta.clear()
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == before
+    assert dataset.meta["env"] == "two_room"
+
+
+def test_torchrl_finds_it(path):
+    dataset = load_dataset(f"ficreg:{path}", batch_size=7, split="all")
+    assert isinstance(dataset, OfflineTrajectories) and dataset.data_path == path
+    named = OfflineTrajectories(path.name, root=path.parent, batch_size=7, split="all")
+    assert named.fingerprint == dataset.fingerprint and named.data_path_root == path.parent
+    assert indices(named, 3) == indices(dataset, 3)
+    assert isinstance(OfflineTrajectories.available_datasets, list)
+    assert "OfflineTrajectories" in repr(dataset) and dataset.can_sample() and dataset.stats()
+
+
+def test_transforms_apply_to_clips(path):
+    def halve(clip):
+        return clip.set("action", clip["action"] / 2)
+
+    plain, halved = (OfflineTrajectories(path, batch_size=7, transform=transform) for transform in (None, halve))
+    assert (halved.sample()["action"] * 2).equal(plain.sample()["action"])
+
+
+def test_memory_and_disk_serve_the_same(path, make_episode, meta):
+    episodes = [make_episode(number, length) for number, length in enumerate(LENGTHS, 1)]
+    disk = OfflineTrajectories(path, batch_size=7)
+    memory = OfflineTrajectories.from_episodes(episodes, meta=meta, batch_size=7)
+    for _ in range(30):
+        assert (disk.sample() == memory.sample()).all()
+    assert disk.fingerprint == memory.fingerprint and disk.meta == memory.meta
+    with pytest.raises(RuntimeError, match="lives in memory"):
+        memory.data_path
+
+
+def _first_batches(dataset, queue):
+    queue.put((indices(dataset, 3), dataset._store.path is not None, dataset.sample()["action"].sum().item()))
+
+
+@pytest.mark.parametrize("prefetch", [None, 2])
+def test_it_continues_in_a_spawned_worker(path, prefetch):
+    dataset = OfflineTrajectories(path, batch_size=7, prefetch=prefetch)
+    indices(dataset, 2)
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    process = context.Process(target=_first_batches, args=(dataset, queue))
+    process.start()
+    arrived = queue.get(timeout=50)
+    process.join()
+    assert arrived == (indices(dataset, 3), True, dataset.sample()["action"].sum().item())
+
+
+def test_pickling_carries_no_data(record):
+    dataset = OfflineTrajectories(record([200] * 12), batch_size=7)
+    dataset.sample()
+    assert len(pickle.dumps(dataset)) < 30_000 < dataset._store.arrays["pixels"].nbytes
+    assert indices(pickle.loads(pickle.dumps(dataset)), 2) == indices(dataset, 2)
+
+
+def test_short_episodes_are_skipped_and_counted(make_episode):
+    episodes = [make_episode(number, 10 if number % 3 == 0 else 20) for number in range(1, 31)]
+    dataset = OfflineTrajectories.from_episodes(episodes, split="all", batch_size=7, keys=("episode",))
+    assert dataset.num_short_episodes == 10 and dataset.num_clips == 20 * 5
+    with pytest.raises(ValueError, match="needs 91 rows"):
+        OfflineTrajectories.from_episodes(episodes, num_frames=4, frame_skip=30)
+
+
+def test_mistakes_are_refused(path, make_episode):
+    with pytest.raises(FileNotFoundError, match="collect.py"):
+        OfflineTrajectories("no_such_dataset", root=path.parent)
+    with pytest.raises(ValueError, match="'train' split holds .* clips, less than one batch of 5000"):
+        OfflineTrajectories(path, batch_size=5000)
+    with pytest.raises(ValueError, match="split must be one of"):
+        OfflineTrajectories(path, split="test")
+    with pytest.raises(RuntimeError, match="batch_size"):
+        OfflineTrajectories(path).batches_per_epoch
+    with pytest.raises(ValueError, match="training split is empty"):
+        OfflineTrajectories.from_episodes([make_episode(1)], split_fractions=(0.001, 0.0, 0.999), split="evaluation")
+    with pytest.raises(TypeError, match="only a ClipSampler"):
+        SeekableReplayBuffer(storage=OfflineTrajectories(path).storage, batch_size=7)
+
+
+def test_pinning_is_harmless_without_an_accelerator(path):
+    batch = OfflineTrajectories(path, batch_size=7, pin_memory=True).sample()
+    assert batch["pixels"].is_pinned() == torch.cuda.is_available()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("prefetch", [None, 2])
+def test_pinned_clips_reach_the_device_unchanged(path, prefetch):
+    pinned = OfflineTrajectories(path, batch_size=7, pin_memory=True, prefetch=prefetch)
+    plain = OfflineTrajectories(path, batch_size=7)
+    for _ in range(5):
+        batch = pinned.sample()
+        assert batch["pixels"].is_pinned()
+        assert (batch.to("cuda", non_blocking=True).cpu() == plain.sample()).all()
+
+
+def test_importing_it_pulls_in_no_simulator():
+    heavy = ("h5py", "wandb", "matplotlib", "mujoco", "dm_control", "pymunk", "pygame")
+    code = f"import sys, torchrl_ficreg.data; print([m for m in {heavy} if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
+    assert result.stdout.strip() == "[]", result.stdout + result.stderr
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])

@@ -1,0 +1,204 @@
+"""Clips: strided sub-trajectories, cut out of episodes when they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torchrl.data import TensorStorage
+from torchrl.data.replay_buffers import Storage
+
+from torchrl_ficreg.data.schema import ACTION, EPISODE, MASK, PIXELS, STATE, STEP
+from torchrl_ficreg.data.statistics import ActionStatistics
+from torchrl_ficreg.data.store import EpisodeStore
+
+CLIP_KEYS = (PIXELS, ACTION, STATE, EPISODE, STEP)
+
+
+def clip_length(num_frames: int, frame_skip: int) -> int:
+    """Rows an episode needs to hold one clip, from its first frame to its last.
+
+    Examples:
+        >>> clip_length(num_frames=4, frame_skip=5)
+        16
+    """
+    return (num_frames - 1) * frame_skip + 1
+
+
+class ClipStorage(TensorStorage):
+    """A read-only storage whose items are the clips of some episodes.
+
+    A clip with T frames and frame skip F begins at some row s of an episode::
+
+        row      s           s+F         s+2F        s+3F
+        pixels   frame 0     frame 1     frame 2     frame 3
+        action   [--block 0-)[--block 1-)[--block 2-)[--block 3-)
+
+    Block k holds the F raw actions of rows s+kF ... s+(k+1)F-1, one after another: it leads from frame k to
+    frame k+1. Every row at which all T frames lie in the episode begins a clip, so an episode of L rows has
+    L - (T-1) F of them, and only the last block can leave its episode (the last row of an episode has no
+    action): it is then zero, and ``mask`` is false there.
+
+    Clips are numbered episode after episode, start after start, which makes any sampler of indices a sampler
+    of clips, and the uniform one uniform over all legal starts. The arrays are never written to.
+
+    Args:
+        store: the recorded episodes.
+        episodes: ids of the episodes to cut clips from. Those shorter than a clip contribute none.
+
+    Keyword Args:
+        num_frames: T.
+        frame_skip: F, environment steps from one frame to the next.
+        keys: what a clip holds: ``pixels`` uint8 [T, 3, H, W], ``action`` float32 [T, F * A] (and with it
+            ``mask`` bool [T]), ``state`` float64 [T, S], ``episode`` int64 [T], ``step`` int64 [T].
+        statistics: z-scores the actions; ``None`` leaves them in environment units.
+
+    Raises:
+        KeyError: an unknown key, or none.
+        ValueError: no episode is long enough for a clip, or T or F is not positive.
+
+    Examples:
+        >>> step = np.arange(12)
+        >>> episode = {
+        ...     "pixels": np.zeros((12, 3, 4, 4), np.uint8),
+        ...     "action": np.where(step < 11, step, 0).astype(np.float32)[:, None],
+        ...     "state": np.zeros((12, 1)),
+        ... }
+        >>> clips = ClipStorage(EpisodeStore.from_episodes([episode]), [1], num_frames=3, frame_skip=4)
+        >>> len(clips)
+        4
+        >>> clips[0]["action"].tolist(), clips[0]["mask"].tolist()  # rows 8..11, and row 11 has no action
+        ([[0.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, 7.0], [0.0, 0.0, 0.0, 0.0]], [True, True, False])
+        >>> clips[[0, 3]]["pixels"].shape
+        torch.Size([2, 3, 3, 4, 4])
+    """
+
+    def __init__(
+        self,
+        store: EpisodeStore,
+        episodes: Sequence[int] | np.ndarray,
+        *,
+        num_frames: int,
+        frame_skip: int,
+        keys: Sequence[str] = (PIXELS, ACTION),
+        statistics: ActionStatistics | None = None,
+    ) -> None:
+        if num_frames < 1 or frame_skip < 1:
+            raise ValueError(f"num_frames and frame_skip must be positive, got {num_frames} and {frame_skip}.")
+        if not keys or not set(keys) <= set(CLIP_KEYS):
+            raise KeyError(f"a clip holds some of {CLIP_KEYS}, got keys={tuple(keys)}.")
+        self.store, self.statistics, self.keys = store, statistics, tuple(keys)
+        self.num_frames, self.frame_skip = num_frames, frame_skip
+        episodes = np.asarray(episodes, dtype=np.int64)
+        starts = store.length[episodes - 1] - clip_length(num_frames, frame_skip) + 1  # [E] legal starts of each
+        self._episode = episodes[starts > 0]
+        self._stop_clip = np.cumsum(starts[starts > 0])  # [E], one past the last clip number of each
+        if not len(self._episode):
+            need = f"{clip_length(num_frames, frame_skip)} rows ({num_frames} frames, {frame_skip} steps apart)"
+            lengths = store.length[episodes - 1]
+            have = f"{lengths.min()} to {lengths.max()} rows" if len(lengths) else "no rows"
+            raise ValueError(
+                f"a clip needs {need}, but the {len(episodes)} episodes have {have}: shorten the clip or record more."
+            )
+        self.num_short_episodes = len(episodes) - len(self._episode)
+        super().__init__(None, max_size=int(self._stop_clip[-1]))
+        self.initialized = True
+
+    def __len__(self) -> int:
+        return self.max_size
+
+    @property
+    def shape(self) -> torch.Size:
+        """[number of clips]."""
+        return torch.Size([self.max_size])
+
+    def get(self, index: int | slice | Sequence[int] | np.ndarray | torch.Tensor | tuple) -> TensorDict:
+        """Reads clips.
+
+        Args:
+            index: clip numbers, of any shape.
+
+        Returns:
+            A tensordict of batch size [*index.shape, T]: [T] for one number, [B, T] for a list of B.
+
+        Raises:
+            IndexError: a number beyond the last clip.
+            TypeError: an index that does not hold integers.
+        """
+        first, stop, episode = self._locate(index)  # each [B...]
+        frame = first[..., None] + np.arange(self.num_frames) * self.frame_skip  # [B..., T]
+        clip: dict[str, Any] = {}
+        for key in self.keys:
+            if key == ACTION:
+                clip[ACTION], clip[MASK] = self._blocks(frame, stop)
+            elif key == EPISODE:
+                clip[key] = torch.from_numpy(np.broadcast_to(episode[..., None], frame.shape).copy())
+            elif key == STEP:
+                clip[key] = torch.from_numpy(frame - self.store.start[episode - 1][..., None])
+            else:
+                # numpy gathers uint8 rows about five times faster than torch's advanced indexing, and does not
+                # share torch's thread pool with the training step.
+                clip[key] = torch.from_numpy(self.store.arrays[key][frame])  # [B..., T, ...]
+        # A device is needed for pinning: TorchRL leaves tensordicts without one alone.
+        return TensorDict(clip, batch_size=frame.shape, device="cpu")
+
+    def _locate(self, index: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """First row of each clip, one past the last row of its episode, and that episode."""
+        if isinstance(index, tuple) and len(index) == 1:
+            (index,) = index
+        if isinstance(index, slice):
+            index = np.arange(*index.indices(len(self)))
+        index = np.asarray(index)
+        if index.dtype == bool:
+            index = np.flatnonzero(index)
+        if index.size and index.dtype.kind not in "iu":
+            raise TypeError(f"clips are picked by integers, got an index of {index.dtype}.")
+        clip = np.where(index < 0, index + len(self), index).astype(np.int64)
+        if clip.size and (clip.min() < 0 or clip.max() >= len(self)):
+            raise IndexError(f"clip numbers run from 0 to {len(self) - 1}, got {index.min()} to {index.max()}.")
+        which = np.searchsorted(self._stop_clip, clip, side="right")
+        episode = self._episode[which]
+        stop = self.store.start[episode - 1] + self.store.length[episode - 1]
+        # Counted back from the end: the last clip of an episode ends on its last row.
+        first = stop - clip_length(self.num_frames, self.frame_skip) - (self._stop_clip[which] - 1 - clip)
+        return first, stop, episode
+
+    def _blocks(self, frame: np.ndarray, stop: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        """Action blocks [..., T, F * A] and their mask [..., T]."""
+        last = stop[..., None] - 1  # [..., 1], the row without an action
+        mask = torch.from_numpy(frame + self.frame_skip <= last)  # [..., T]
+        rows = np.minimum(frame[..., None] + np.arange(self.frame_skip), last[..., None])  # [..., T, F]
+        block = torch.from_numpy(self.store.arrays[ACTION][rows]).flatten(-2)  # [..., T, F, A] -> [..., T, F * A]
+        if self.statistics is not None:
+            block = self.statistics.normalize(block)
+        # Selected rather than multiplied, and after z-scoring: a masked block is zero, not minus mean over std.
+        return torch.where(mask[..., None], block, block.new_zeros(())), mask
+
+    def set(self, *args: Any, **kwargs: Any) -> None:
+        """Refuses: recorded clips are not written to."""
+        raise RuntimeError("recorded clips cannot be changed: write new episodes with EpisodeWriter.")
+
+    def _empty(self) -> None:
+        self.set()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: the data is on disk already and must not travel with every checkpoint."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Nothing to restore."""
+
+    def dumps(self, path: Any) -> None:
+        """Nothing to save, as in :meth:`state_dict`."""
+
+    def loads(self, path: Any) -> None:
+        """Nothing to restore."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        # TensorStorage would move its tensors to shared memory here; the store maps its files again instead.
+        state = Storage.__getstate__(self)
+        state.pop("_len_value", None)
+        return state

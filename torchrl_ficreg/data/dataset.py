@@ -1,0 +1,282 @@
+"""The offline dataset: recorded episodes as a TorchRL replay buffer of clips."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import ImmutableDatasetWriter
+from torchrl.data.datasets.common import BaseDatasetExperienceReplay
+from torchrl.data.datasets.utils import _get_root_dir
+from torchrl.envs.utils import _classproperty
+
+from torchrl_ficreg.data.clips import ClipStorage
+from torchrl_ficreg.data.layout import META_FILE
+from torchrl_ficreg.data.replay import SeekableReplayBuffer
+from torchrl_ficreg.data.sampler import ClipSampler
+from torchrl_ficreg.data.schema import ACTION, DONE, EPISODE, PIXELS, STEP
+from torchrl_ficreg.data.splits import Split, split_episodes
+from torchrl_ficreg.data.statistics import ActionStatistics
+from torchrl_ficreg.data.store import EpisodeStore, Verify
+
+
+class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
+    """Serves clips of recorded episodes, for training a world model offline.
+
+    :meth:`sample` returns a tensordict of batch size [B, T]: see :class:`~torchrl_ficreg.data.ClipStorage` for the
+    picture of a clip, :class:`~torchrl_ficreg.data.ClipSampler` for the order and
+    :class:`~torchrl_ficreg.data.SeekableReplayBuffer` for resuming. Iterating yields what is left of the current
+    epoch. ``len(dataset)`` is its number of clips and ``dataset[i]`` the i-th of them.
+
+    The data is read-only: ``extend`` refuses, and writing into a returned tensor never reaches the files.
+
+    Args:
+        dataset_id: a dataset directory, its name under ``root``, or an opened
+            :class:`~torchrl_ficreg.data.EpisodeStore`, which the datasets of several splits can share.
+
+    Keyword Args:
+        root: where names are looked up. Default ``~/.cache/torchrl/torchrl_ficreg``.
+        split: which episodes to serve; see :func:`~torchrl_ficreg.data.split_episodes`.
+        split_fractions: parts of train, validation and evaluation.
+        split_seed: seed of the split.
+        num_frames: T, frames of a clip.
+        frame_skip: F, environment steps from one frame to the next.
+        batch_size: B, in clips. Needed for iterating, for ``drop_last`` and for ``prefetch``.
+        keys: what a clip holds, among ``pixels``, ``action`` (with ``mask``), ``state``, ``episode``, ``step``.
+        statistics: z-scores the actions. Default: measured on the training episodes, whatever ``split`` is.
+        shuffle: ``False`` serves clips in their stored order.
+        drop_last: leave out an incomplete last batch of an epoch; has no effect without ``batch_size``.
+        seed: seed of the order.
+        prefetch: batches read ahead by one background thread. The order and :meth:`state_dict` do not depend on it.
+        pin_memory: put batches in pinned memory; has no effect without a CUDA device.
+        transform: a TorchRL transform of sampled clips.
+        allow_incomplete: accept a dataset whose collection has not reached its target.
+        verify: whose checksums to compare when opening: ``"ends"`` (first and last episode), ``"full"`` or ``"none"``.
+
+    Raises:
+        FileNotFoundError: there is no such dataset.
+        KeyError: an unknown key.
+        ValueError: the dataset is incomplete or damaged, no episode of the split is long enough for a clip, the split
+            does not fill one batch, or an argument is out of range.
+
+    Examples:
+        >>> rng = np.random.default_rng(0)
+        >>> episodes = [
+        ...     {
+        ...         "pixels": rng.integers(0, 256, (40, 3, 8, 8), dtype=np.uint8),
+        ...         "action": np.pad(rng.normal(size=(39, 2)), ((0, 1), (0, 0))).astype(np.float32),
+        ...         "state": rng.normal(size=(40, 4)),
+        ...     }
+        ...     for _ in range(10)
+        ... ]
+        >>> dataset = OfflineTrajectories.from_episodes(episodes, batch_size=16, num_frames=4, frame_skip=5)
+        >>> batch = dataset.sample()
+        >>> batch.batch_size, batch["pixels"].shape, batch["action"].shape
+        (torch.Size([16, 4]), torch.Size([16, 4, 3, 8, 8]), torch.Size([16, 4, 10]))
+        >>> dataset.num_clips, dataset.batches_per_epoch  # 7 of the 10 train, with 25 starts each
+        (175, 10)
+    """
+
+    def __init__(
+        self,
+        dataset_id: str | Path | EpisodeStore,
+        *,
+        root: str | Path | None = None,
+        split: Split = "train",
+        split_fractions: tuple[float, float, float] = (0.8, 0.1, 0.1),
+        split_seed: int = 0,
+        num_frames: int = 4,
+        frame_skip: int = 5,
+        batch_size: int | None = None,
+        keys: Sequence[str] = (PIXELS, ACTION),
+        statistics: ActionStatistics | None = None,
+        shuffle: bool = True,
+        drop_last: bool = True,
+        seed: int = 0,
+        prefetch: int | None = None,
+        pin_memory: bool = False,
+        transform: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        allow_incomplete: bool = False,
+        verify: Verify = "ends",
+    ) -> None:
+        self.root = _get_root_dir("torchrl_ficreg") if root is None else Path(root).expanduser()
+        if isinstance(dataset_id, EpisodeStore):
+            store = dataset_id
+        else:
+            path = self._resolve(dataset_id)
+            store = EpisodeStore.open(path, allow_incomplete=allow_incomplete, verify=verify)
+        self.dataset_id = str(store.path or "memory") if isinstance(dataset_id, EpisodeStore) else str(dataset_id)
+        self.split = split
+        divide = {"fractions": tuple(split_fractions), "seed": split_seed}
+        ids = split_episodes(store.num_episodes, split, **divide)
+        if statistics is None:
+            statistics = _measure(store, split_episodes(store.num_episodes, "train", **divide))
+        elif statistics.action_dim != store.header.shapes[ACTION][0]:
+            got, want = statistics.action_dim, store.header.shapes[ACTION][0]
+            raise ValueError(f"statistics describe {got} action dimensions, the dataset has {want}.")
+        clips = ClipStorage(
+            store, ids, num_frames=num_frames, frame_skip=frame_skip, keys=keys, statistics=statistics
+        )
+        self._store, self._episode_ids, self._statistics = store, ids, statistics
+        drop_last = drop_last and batch_size is not None
+        if batch_size is not None and len(clips) < (batch_size if drop_last else 1):
+            raise ValueError(
+                f"the {split!r} split holds {len(clips)} clips, less than one batch of {batch_size}: lower batch_size "
+                "or pass drop_last=False."
+            )
+        super().__init__(
+            storage=clips,
+            sampler=ClipSampler(shuffle=shuffle, drop_last=drop_last, seed=seed),
+            writer=ImmutableDatasetWriter(),
+            batch_size=batch_size,
+            prefetch=prefetch,
+            pin_memory=pin_memory and torch.cuda.is_available(),
+            transform=transform,
+        )
+
+    @classmethod
+    def from_episodes(
+        cls, episodes: Iterable[Mapping[str, np.ndarray]], *, meta: Mapping[str, Any] | None = None, **kwargs: Any
+    ) -> OfflineTrajectories:
+        """A dataset in memory, for tests and small studies.
+
+        Args:
+            episodes: see :func:`~torchrl_ficreg.data.schema.check_episode`.
+            meta: what :attr:`meta` returns.
+            **kwargs: as for the class.
+        """
+        return cls(EpisodeStore.from_episodes(episodes, meta=meta), **kwargs)
+
+    @property
+    def statistics(self) -> ActionStatistics:
+        """The z-scores of ``action``: a checkpoint needs them."""
+        return self._statistics
+
+    @property
+    def meta(self) -> dict[str, Any]:
+        """What the collection noted about itself (a copy)."""
+        return deepcopy(self._store.header.meta)
+
+    @property
+    def fingerprint(self) -> str:
+        """sha256 that changes with any byte of any episode; to be stored with results."""
+        return self._store.fingerprint
+
+    @property
+    def episodes(self) -> TensorDict:
+        """The episodes of this split: ``episode`` (id), ``start`` (row) and ``length``, int64 [E] each."""
+        position = self._episode_ids - 1
+        columns = {EPISODE: self._episode_ids, "start": self._store.start[position]}
+        columns["length"] = self._store.length[position]
+        return TensorDict({key: torch.tensor(value) for key, value in columns.items()}, [len(position)])
+
+    @property
+    def num_clips(self) -> int:
+        """Legal clip starts in this split."""
+        return len(self._storage)
+
+    @property
+    def num_steps(self) -> int:
+        """Rows in this split."""
+        return int(self._store.length[self._episode_ids - 1].sum())
+
+    @property
+    def num_short_episodes(self) -> int:
+        """Episodes of this split that are shorter than a clip and are never served."""
+        return self._storage.num_short_episodes
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        return self._storage.num_frames
+
+    @property
+    def frame_skip(self) -> int:
+        """F."""
+        return self._storage.frame_skip
+
+    @property
+    def action_dim(self) -> int:
+        """A, the size of one raw action."""
+        return self._statistics.action_dim
+
+    def row(self, episode: int, step: int) -> int:
+        """The row of a step of an episode of this split.
+
+        Raises:
+            IndexError: the episode has no such step.
+            KeyError: the split has no such episode.
+        """
+        rows = self._rows(episode)
+        if not 0 <= step < rows.stop - rows.start:
+            raise IndexError(f"episode {episode} has steps 0 to {rows.stop - rows.start - 1}, got {step}.")
+        return rows.start + step
+
+    def episode_data(self, episode: int) -> TensorDict:
+        """One whole episode of this split, in environment units and without a copy.
+
+        Returns:
+            [L]: ``pixels``, ``action``, ``state``, ``episode``, ``step`` and ``("next", "done")``.
+
+        Raises:
+            KeyError: the split has no such episode.
+        """
+        rows = self._rows(episode)
+        length = rows.stop - rows.start
+        data = TensorDict({key: torch.from_numpy(array[rows]) for key, array in self._store.arrays.items()}, [length])
+        data[EPISODE] = torch.full((length,), episode)
+        data[STEP] = torch.arange(length)
+        data[DONE] = (data[STEP] == length - 1).unsqueeze(-1)  # [L, 1]
+        return data
+
+    @_classproperty
+    def available_datasets(cls) -> list[str]:  # noqa: N805
+        """Names of the datasets under the default root."""
+        return sorted(file.parent.name for file in Path(_get_root_dir("torchrl_ficreg")).glob(f"*/{META_FILE}"))
+
+    @property
+    def data_path(self) -> Path:
+        """The directory of the dataset.
+
+        Raises:
+            RuntimeError: the dataset lives in memory.
+        """
+        if self._store.path is None:
+            raise RuntimeError("a dataset made by from_episodes() lives in memory and has no path.")
+        return self._store.path
+
+    @property
+    def data_path_root(self) -> Path:
+        """The directory that holds the dataset's."""
+        return self.data_path.parent
+
+    def _is_downloaded(self) -> bool:
+        return self._store.num_episodes >= self._store.header.target_episodes
+
+    def preprocess(self, *args: Any, **kwargs: Any) -> None:
+        """Refuses: clips are cut when read, so there are no rows to map."""
+        raise RuntimeError("clips are cut when read: pass transform=, or write new episodes with EpisodeWriter.")
+
+    def _resolve(self, dataset_id: str | Path) -> Path:
+        path = Path(dataset_id).expanduser()
+        return path if path.is_dir() or path.is_absolute() else Path(self.root) / path
+
+    def _rows(self, episode: int) -> slice:
+        position = np.searchsorted(self._episode_ids, episode)
+        if position == len(self._episode_ids) or self._episode_ids[position] != episode:
+            raise KeyError(f"the {self.split!r} split has no episode {episode}: choose one of dataset.episodes.")
+        return self._store.rows(episode)
+
+
+def _measure(store: EpisodeStore, episodes: np.ndarray) -> ActionStatistics:
+    """Statistics of the actions of some episodes, without each last row, where no action was taken."""
+    rows = [store.rows(episode) for episode in episodes]
+    if not rows:
+        raise ValueError("the training split is empty, so it has no action statistics: record more, or pass them.")
+    action = np.concatenate([store.arrays[ACTION][span.start : span.stop - 1] for span in rows])  # [N, A]
+    return ActionStatistics.from_actions(torch.from_numpy(action))

@@ -1,0 +1,217 @@
+"""What a dataset directory looks like, and how its two text files are read and written.
+
+::
+
+    <dataset>/
+      meta.json          written once, atomically: format version, row shapes, target, the user's own fields
+      episodes.jsonl     the index: one line per *committed* episode
+      pixels.memmap      raw little-endian rows, episode after episode, nothing between them
+      action.memmap
+      state.memmap
+
+The index alone says what exists. Bytes of a data file beyond the rows of the last index line belong to an
+episode that was never committed, and a last line without its newline was never committed either: readers
+ignore both, a writer cuts them off. Everything else that does not fit is damage and raises.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zlib
+from dataclasses import dataclass, replace
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torchrl_ficreg.data.schema import ACTION, PIXELS, STATE
+
+FORMAT = "torchrl_ficreg.episodes"
+VERSION = 1
+META_FILE = "meta.json"
+INDEX_FILE = "episodes.jsonl"
+DTYPES = {PIXELS: np.dtype("<u1"), ACTION: np.dtype("<f4"), STATE: np.dtype("<f8")}
+
+COLLECT_HINT = "collect it with `python sota-implementations/ficreg/collect.py env={env}`"
+
+
+@dataclass(frozen=True)
+class Header:
+    """The content of ``meta.json``.
+
+    Attributes:
+        target_episodes: number of episodes that makes the dataset complete.
+        shapes: key -> shape of one row, for example ``{"pixels": (3, 224, 224), "action": (2,), "state": (4,)}``.
+        meta: the user's own fields, as they come back from JSON.
+    """
+
+    target_episodes: int
+    shapes: dict[str, tuple[int, ...]]
+    meta: dict[str, Any]
+
+    def row_bytes(self, key: str) -> int:
+        """Bytes of one row of ``key``."""
+        return DTYPES[key].itemsize * prod(self.shapes[key])
+
+    def with_target(self, target_episodes: int) -> Header:
+        """The same header with another target."""
+        return replace(self, target_episodes=target_episodes)
+
+    def to_json(self) -> str:
+        """The text of ``meta.json``."""
+        content = {
+            "format": FORMAT,
+            "version": VERSION,
+            "target_episodes": self.target_episodes,
+            "shapes": {key: list(shape) for key, shape in self.shapes.items()},
+            "dtypes": {key: dtype.str for key, dtype in DTYPES.items()},
+            "meta": self.meta,
+        }
+        return json.dumps(content, indent=2, sort_keys=True) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str, where: str | Path) -> Header:
+        """Reads ``meta.json``; ``where`` names it in errors.
+
+        Raises:
+            ValueError: no JSON, not this format, another version, or a missing field.
+        """
+        try:
+            content = json.loads(text)
+            if content["format"] != FORMAT:
+                raise KeyError(FORMAT)
+            version = content["version"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{where} is not the header of a {FORMAT} dataset: collect or copy it again.") from error
+        if version != VERSION:
+            raise ValueError(f"{where} has format version {version!r}, this code reads {VERSION}: collect it again.")
+        try:
+            shapes = {key: tuple(content["shapes"][key]) for key in DTYPES}
+            return cls(int(content["target_episodes"]), shapes, dict(content["meta"]))
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{where} lacks or garbles the field {error}: collect or copy it again.") from error
+
+
+class IndexEntry(NamedTuple):
+    """One line of ``episodes.jsonl``: a committed episode.
+
+    Attributes:
+        episode: id, from 1 and without gaps.
+        start: its first row in every data file.
+        length: its number of rows.
+        crc: crc32 of its action bytes followed by its state bytes.
+        pixels_crc: crc32 of its pixel bytes.
+    """
+
+    episode: int
+    start: int
+    length: int
+    crc: int
+    pixels_crc: int
+
+    @property
+    def stop(self) -> int:
+        """One past its last row."""
+        return self.start + self.length
+
+    def to_line(self) -> bytes:
+        """The line, newline included: a line without it does not count."""
+        return json.dumps(self._asdict()).encode() + b"\n"
+
+
+def parse_index(content: bytes, where: str | Path) -> tuple[list[IndexEntry], int]:
+    """Reads the index and drops a torn last line.
+
+    Args:
+        content: the bytes of ``episodes.jsonl``.
+        where: its name, for errors.
+
+    Returns:
+        The committed episodes, and how many leading bytes of ``content`` they occupy.
+
+    Raises:
+        ValueError: a whole line is garbled, or does not continue the one before it.
+
+    Examples:
+        >>> first = IndexEntry(1, 0, 21, 7, 8)
+        >>> entries, committed = parse_index(first.to_line() + b'{"episode": 2, "sta', "episodes.jsonl")
+        >>> entries == [first], committed == len(first.to_line())
+        (True, True)
+    """
+    committed = content.rfind(b"\n") + 1
+    entries: list[IndexEntry] = []
+    for number, line in enumerate(content[:committed].splitlines(), start=1):
+        try:
+            entry = IndexEntry(**json.loads(line))
+            whole = all(isinstance(value, int) for value in entry)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{where}, line {number} is garbled: restore the file or collect again.") from error
+        expected = (number, entries[-1].stop if entries else 0)
+        if not whole or (entry.episode, entry.start) != expected or entry.length < 1:
+            got = f"episode {entry.episode} at row {entry.start} with {entry.length} rows"
+            want = f"episode {expected[0]} at row {expected[1]}"
+            raise ValueError(f"{where}, line {number} holds {got}, expected {want}: restore it or collect again.")
+        entries.append(entry)
+    return entries, committed
+
+
+def checksums(episode: dict[str, np.ndarray]) -> tuple[int, int]:
+    """crc32 of (action then state) and of the pixels of one episode, as stored.
+
+    Examples:
+        >>> zero = {"pixels": np.zeros((2, 3, 4, 4), "u1"), "action": np.zeros((2, 2), "f4"), "state": np.zeros((2, 1))}
+        >>> checksums(zero) == (zlib.crc32(bytes(2 * 2 * 4 + 2 * 8)), zlib.crc32(bytes(2 * 3 * 16)))
+        True
+    """
+    action, state, pixels = (np.ascontiguousarray(episode[key], DTYPES[key]) for key in (ACTION, STATE, PIXELS))
+    return zlib.crc32(state, zlib.crc32(action)), zlib.crc32(pixels)
+
+
+def data_file(path: Path, key: str) -> Path:
+    """The file that holds the rows of ``key``."""
+    return path / f"{key}.memmap"
+
+
+def check_sizes(path: Path, header: Header, num_steps: int) -> None:
+    """Checks that every data file is long enough for the rows that the index promises.
+
+    Raises:
+        ValueError: a data file is missing or too short.
+    """
+    for key in DTYPES:
+        file = data_file(path, key)
+        need = num_steps * header.row_bytes(key)
+        size = file.stat().st_size if file.exists() else 0
+        if size < need or not file.exists():
+            raise ValueError(f"{file} is damaged: {size} bytes, the index needs {need}: restore it or collect again.")
+
+
+def write_header(path: Path, header: Header) -> None:
+    """Writes ``meta.json`` so that a crash leaves the old file or the new one, never a half."""
+    temporary = path / f"{META_FILE}.tmp"
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    try:
+        write_all(descriptor, header.to_json().encode())
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+    os.replace(temporary, path / META_FILE)
+    sync_directory(path)
+
+
+def write_all(descriptor: int, data: Any) -> None:
+    """Writes a whole buffer: one ``write`` may stop short of it (2 GiB on Linux)."""
+    view = memoryview(data).cast("B")
+    while view:
+        view = view[os.write(descriptor, view) :]
+
+
+def sync_directory(path: Path) -> None:
+    """Makes the names in a directory durable, as ``fsync`` of a file does for its bytes."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

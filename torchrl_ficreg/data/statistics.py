@@ -1,0 +1,91 @@
+"""Z-scoring of actions, per raw action dimension."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_SMALLEST_STD = 1e-8  # as the LeWM recipe floors it; below it a dimension counts as constant
+
+
+@dataclass(frozen=True, eq=False)
+class ActionStatistics:
+    """Mean and population standard deviation of each raw action dimension.
+
+    Models see z-scored actions, environments see their own units. The statistics come from training episodes
+    only and travel with a model's checkpoint, so that a model can be used without its dataset.
+
+    Both directions accept single actions and action blocks alike: a last axis of size F * A holds F raw
+    actions one after another (time-major), each z-scored with the same A numbers.
+
+    Attributes:
+        mean: float32 [A], environment units.
+        std: float32 [A], environment units, positive. Exactly 1 where the action never changes: that dimension
+            carries nothing, is 0 once normalized, and comes back unchanged.
+
+    Raises:
+        ValueError: ``mean`` and ``std`` are not two equal [A] vectors, finite, with positive ``std``.
+
+    Examples:
+        >>> action = torch.tensor([[1.0, 7.0], [3.0, 7.0]])
+        >>> statistics = ActionStatistics.from_actions(action)
+        >>> statistics.mean, statistics.std
+        (tensor([2., 7.]), tensor([1., 1.]))
+        >>> statistics.normalize(action)
+        tensor([[-1.,  0.],
+                [ 1.,  0.]])
+        >>> statistics.normalize(action.flatten())  # one block of two actions
+        tensor([-1.,  0.,  1.,  0.])
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __post_init__(self) -> None:
+        if self.mean.ndim != 1 or self.mean.shape != self.std.shape or not self.mean.numel():
+            got = f"{tuple(self.mean.shape)} and {tuple(self.std.shape)}"
+            raise ValueError(f"mean and std must be two vectors [A] of one size, got {got}.")
+        if not (self.mean.isfinite().all() and self.std.isfinite().all() and (self.std > 0).all()):
+            raise ValueError(f"mean must be finite and std positive, got {self.mean.tolist()}, {self.std.tolist()}.")
+
+    @classmethod
+    def from_actions(cls, action: Tensor) -> ActionStatistics:
+        """Measures the statistics, accumulating in float64.
+
+        Args:
+            action: [N, A] raw actions, without the rows at which no action was taken.
+
+        Raises:
+            ValueError: not [N, A] with N >= 1, or not finite.
+        """
+        if action.ndim != 2 or not len(action):
+            raise ValueError(f"action must be [N, A] with at least one row, got {tuple(action.shape)}.")
+        action = action.double()  # [N, A]
+        if not action.isfinite().all():
+            raise ValueError("action holds a NaN or an infinity: leave out the rows at which no action was taken.")
+        std, mean = torch.std_mean(action, dim=0, correction=0)  # [A], [A]
+        std = torch.where(std < _SMALLEST_STD, torch.ones_like(std), std)
+        return cls(mean.float(), std.float())
+
+    @property
+    def action_dim(self) -> int:
+        """A."""
+        return len(self.mean)
+
+    def normalize(self, action: Tensor) -> Tensor:
+        """Environment units to z-scores, ``(action - mean) / std``; [..., A] or [..., F * A], same shape out."""
+        raw = self._split(action)  # [..., F, A]
+        return ((raw - self.mean.to(raw)) / self.std.to(raw)).reshape(action.shape)
+
+    def denormalize(self, action: Tensor) -> Tensor:
+        """Z-scores to environment units, ``action * std + mean``; [..., A] or [..., F * A], same shape out."""
+        raw = self._split(action)  # [..., F, A]
+        return (raw * self.std.to(raw) + self.mean.to(raw)).reshape(action.shape)
+
+    def _split(self, action: Tensor) -> Tensor:
+        if not action.ndim or action.shape[-1] % self.action_dim:
+            want = f"a multiple of {self.action_dim} (the action dimension)"
+            raise ValueError(f"the last axis must be {want}, got shape {tuple(action.shape)}.")
+        return action.unflatten(-1, (-1, self.action_dim))

@@ -1,0 +1,177 @@
+"""Recorded episodes opened for reading: from a dataset directory, or from memory."""
+
+from __future__ import annotations
+
+import hashlib
+import mmap
+import os
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from torchrl_ficreg.data.layout import (
+    check_sizes,
+    checksums,
+    COLLECT_HINT,
+    data_file,
+    DTYPES,
+    Header,
+    INDEX_FILE,
+    IndexEntry,
+    META_FILE,
+    parse_index,
+)
+from torchrl_ficreg.data.schema import check_episode
+
+Verify = Literal["ends", "full", "none"]
+
+# Python names this flag from 3.13 on. Without it Linux refuses a private mapping larger than its memory, because
+# every page of it might be written to; paper-scale datasets are several times larger than memory.
+_MAP_NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" else 0)
+
+
+class EpisodeStore:
+    """All committed episodes of a dataset as flat, episode-contiguous arrays.
+
+    ::
+
+        row      0 1 2 3 4 5 | 6 7 8 9 | 10 ...
+        episode  1           | 2       | 3
+        start    0             6         10
+
+    The arrays of a directory are private mappings: pages are read when touched, and a write stays in this
+    process. Pickling a store of a directory carries its path, not its data, and maps again on arrival.
+
+    Args:
+        header: target, row shapes and the user's fields.
+        entries: the committed episodes.
+        arrays: key -> [N, ...] rows.
+        path: the directory the arrays were mapped from, or ``None`` for data in memory.
+
+    Attributes:
+        start: int64 [E], first row of each episode; episode ``e`` is entry ``e - 1``.
+        length: int64 [E], rows of each episode.
+        fingerprint: sha256 of the index, and through its checksums of the data.
+    """
+
+    def __init__(
+        self, header: Header, entries: list[IndexEntry], arrays: dict[str, np.ndarray], path: Path | None = None
+    ) -> None:
+        self.header = header
+        self.path = path
+        self.arrays = arrays
+        self.start = np.array([entry.start for entry in entries], dtype=np.int64)
+        self.length = np.array([entry.length for entry in entries], dtype=np.int64)
+        self.fingerprint = hashlib.sha256(b"".join(entry.to_line() for entry in entries)).hexdigest()
+
+    @property
+    def num_steps(self) -> int:
+        """Rows over all episodes."""
+        return int(self.length.sum())
+
+    @property
+    def num_episodes(self) -> int:
+        """Committed episodes."""
+        return len(self.length)
+
+    def rows(self, episode: int) -> slice:
+        """The rows of an episode (ids begin at 1)."""
+        start = int(self.start[episode - 1])
+        return slice(start, start + int(self.length[episode - 1]))
+
+    @classmethod
+    def open(cls, path: Path, *, allow_incomplete: bool = False, verify: Verify = "ends") -> EpisodeStore:
+        """Opens a dataset directory.
+
+        Args:
+            path: the directory.
+            allow_incomplete: accept fewer episodes than the target.
+            verify: whose checksums to compare: the first and last episode's, every episode's, or nobody's.
+
+        Raises:
+            FileNotFoundError: there is no dataset at ``path``.
+            ValueError: the dataset is damaged, incomplete, empty or of another format version.
+        """
+        if verify not in ("ends", "full", "none"):
+            raise ValueError(f"verify must be 'ends', 'full' or 'none', got {verify!r}.")
+        if not (path / META_FILE).is_file():
+            raise FileNotFoundError(f"no dataset at {path}: {COLLECT_HINT.format(env='<env>')}, or correct the path.")
+        header = Header.from_json((path / META_FILE).read_text(), path / META_FILE)
+        if not (path / INDEX_FILE).is_file():
+            raise ValueError(f"{path} is damaged: {INDEX_FILE} is missing: restore it or collect again.")
+        entries, _ = parse_index((path / INDEX_FILE).read_bytes(), path / INDEX_FILE)
+        if not entries or (len(entries) < header.target_episodes and not allow_incomplete):
+            hint = COLLECT_HINT.format(env=header.meta.get("env", "<env>"))
+            escape = ", or pass allow_incomplete=True" if entries else ""
+            got = f"{len(entries)} of {header.target_episodes} episodes"
+            raise ValueError(f"{path} holds {got}: {hint}, which continues{escape}.")
+        check_sizes(path, header, entries[-1].stop)
+        store = cls(header, entries, _map_rows(path, header, entries[-1].stop), path)
+        checked = {"ends": {entries[0], entries[-1]}, "full": entries, "none": ()}[verify]
+        for entry in checked:
+            store._check(entry)
+        return store
+
+    @classmethod
+    def from_episodes(
+        cls, episodes: Iterable[Mapping[str, np.ndarray]], *, meta: Mapping[str, Any] | None = None
+    ) -> EpisodeStore:
+        """Copies episodes into memory, under the same checks as when they are written to disk.
+
+        Raises:
+            KeyError, ValueError: an episode breaks the key contract, the row shapes differ, or there is none.
+        """
+        episodes = [dict(episode) for episode in episodes]
+        if not episodes:
+            raise ValueError("a dataset needs at least one episode, got none.")
+        entries: list[IndexEntry] = []
+        shapes = {key: tuple(episodes[0][key].shape[1:]) for key in DTYPES if key in episodes[0]}
+        for number, episode in enumerate(episodes, start=1):
+            length = check_episode(episode)
+            found = {key: tuple(episode[key].shape[1:]) for key in DTYPES}
+            if found != shapes:
+                raise ValueError(f"row shapes must be those of the first episode, {shapes}, got {found}.")
+            entries.append(IndexEntry(number, entries[-1].stop if entries else 0, length, *checksums(episode)))
+        arrays = {key: np.concatenate([episode[key] for episode in episodes]) for key in DTYPES}
+        return cls(Header(len(episodes), shapes, dict(meta or {})), entries, arrays)
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = self.__dict__.copy()
+        if self.path is not None:
+            state["arrays"] = None
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if self.path is not None:
+            check_sizes(self.path, self.header, self.num_steps)
+            self.arrays = _map_rows(self.path, self.header, self.num_steps)
+
+    def _check(self, entry: IndexEntry) -> None:
+        rows = slice(entry.start, entry.stop)
+        if checksums({key: array[rows] for key, array in self.arrays.items()}) != (entry.crc, entry.pixels_crc):
+            raise ValueError(
+                f"{self.path} is damaged: the bytes of episode {entry.episode} do not match their checksum: "
+                "restore the files or collect again."
+            )
+
+
+def _map_rows(path: Path, header: Header, num_steps: int) -> dict[str, np.ndarray]:
+    """Maps the first ``num_steps`` rows of every key, copy-on-write."""
+    arrays = {}
+    for key, dtype in DTYPES.items():
+        descriptor = os.open(data_file(path, key), os.O_RDONLY)
+        try:
+            mapped = mmap.mmap(
+                descriptor,
+                num_steps * header.row_bytes(key),
+                flags=mmap.MAP_PRIVATE | _MAP_NORESERVE,
+                prot=mmap.PROT_READ | mmap.PROT_WRITE,
+            )
+        finally:
+            os.close(descriptor)
+        arrays[key] = np.frombuffer(mapped, dtype).reshape(num_steps, *header.shapes[key])
+    return arrays

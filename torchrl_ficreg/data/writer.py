@@ -1,0 +1,256 @@
+"""Crash-safe, append-only recording of episodes."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Mapping
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_ficreg.data.layout import (
+    check_sizes,
+    checksums,
+    data_file,
+    DTYPES,
+    Header,
+    INDEX_FILE,
+    IndexEntry,
+    META_FILE,
+    parse_index,
+    sync_directory,
+    write_all,
+    write_header,
+)
+from torchrl_ficreg.data.schema import ACTION, check_episode, PIXELS, STATE
+
+
+class EpisodeWriter:
+    """Appends episodes to a dataset directory; the process may be killed at any instant.
+
+    An episode is *committed* by its index line, which is written only after its rows are on disk::
+
+        rows -> pixels, action, state files -> fsync -> index line -> fsync
+
+    A crash therefore loses at most the episode being appended. Opening the directory again cuts every file
+    back to the last committed episode, and :attr:`num_episodes` says where to continue: a collection that
+    derives episode k from ``(seed, k)`` can simply be run again and never repeats or skips one.
+
+    Args:
+        path: directory of the dataset, created when missing.
+
+    Keyword Args:
+        target_episodes: the number of episodes that makes the dataset complete.
+        meta: whatever reproduces the data (environment, its arguments, image size, seed, expert, action bounds);
+            anything JSON can hold, numpy values included.
+        resume: continue an existing dataset. With ``False`` an existing dataset is an error.
+
+    Raises:
+        FileExistsError: the dataset exists and ``resume`` is false.
+        RuntimeError: another writer has the dataset open.
+        TypeError: ``meta`` holds something JSON cannot.
+        ValueError: the dataset was begun with another ``meta`` or a larger target, or is damaged.
+
+    Examples:
+        >>> import tempfile, numpy as np
+        >>> steps = 30
+        >>> episode = {
+        ...     "pixels": np.zeros((steps, 3, 8, 8), dtype=np.uint8),
+        ...     "action": np.zeros((steps, 2), dtype=np.float32),
+        ...     "state": np.zeros((steps, 4), dtype=np.float64),
+        ... }
+        >>> with tempfile.TemporaryDirectory() as path:
+        ...     with EpisodeWriter(path, target_episodes=2, meta={"env": "two_room", "seed": 0}) as writer:
+        ...         _ = writer.append(episode)
+        ...     with EpisodeWriter(path, target_episodes=2, meta={"env": "two_room", "seed": 0}) as writer:
+        ...         for number in range(writer.num_episodes, writer.target_episodes):
+        ...             _ = writer.append(episode)
+        ...         writer.finish()
+        ...     writer.num_episodes, writer.num_steps, writer.complete
+        (2, 60, True)
+    """
+
+    def __init__(
+        self, path: str | Path, *, target_episodes: int, meta: Mapping[str, Any], resume: bool = True
+    ) -> None:
+        if target_episodes < 1:
+            raise ValueError(f"target_episodes must be at least 1, got {target_episodes}.")
+        self.path = Path(path).expanduser()
+        self.target_episodes = int(target_episodes)
+        self.meta: dict[str, Any] = json.loads(json.dumps(dict(meta), default=_to_builtin))
+        self.num_episodes = 0
+        self.num_steps = 0
+        self._header: Header | None = None
+        self._index_bytes = 0
+        self._files: dict[str, int] = {}
+        if not resume and (self.path / META_FILE).exists():
+            raise FileExistsError(f"{self.path} already holds a dataset: pass resume=True, or another directory.")
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._index = os.open(self.path / INDEX_FILE, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            self._lock()
+            if (self.path / META_FILE).exists():
+                self._resume()
+            elif os.fstat(self._index).st_size:
+                raise ValueError(f"{self.path} has an index but no {META_FILE}: restore it, or use another directory.")
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def complete(self) -> bool:
+        """Whether the target has been reached."""
+        return self.num_episodes >= self.target_episodes
+
+    def append(self, episode: dict[str, np.ndarray]) -> int:
+        """Writes and commits one episode.
+
+        Args:
+            episode: see :func:`~torchrl_ficreg.data.schema.check_episode`; row shapes as in the first episode.
+
+        Returns:
+            The id of the episode, from 1.
+
+        Raises:
+            KeyError, ValueError: the episode breaks the key contract or has other row shapes than the first.
+            OSError: the disk is full or fails. The dataset still holds every episode committed before.
+            RuntimeError: the writer is closed, or the target has been reached.
+        """
+        if self._index < 0:
+            raise RuntimeError(f"the writer of {self.path} is closed: open a new one to continue.")
+        if self.complete:
+            raise RuntimeError(f"{self.path} holds its {self.target_episodes} episodes: open it with a larger target.")
+        length = check_episode(episode)
+        shapes = {key: tuple(episode[key].shape[1:]) for key in DTYPES}
+        if self._header is None:
+            self._begin(shapes)
+        elif shapes != self._header.shapes:
+            raise ValueError(f"row shapes must stay {self._header.shapes}, got {shapes}: use another directory.")
+        entry = IndexEntry(self.num_episodes + 1, self.num_steps, length, *checksums(episode))
+        line = entry.to_line()
+        try:
+            for key, dtype in DTYPES.items():
+                write_all(self._files[key], np.ascontiguousarray(episode[key], dtype))
+            for descriptor in self._files.values():
+                os.fsync(descriptor)
+            write_all(self._index, line)
+            os.fsync(self._index)
+        except BaseException:
+            # Cutting files back needs no space, so this also holds on a full disk. If even that fails, the
+            # next opening does it.
+            self._truncate()
+            raise
+        self.num_episodes, self.num_steps = entry.episode, entry.stop
+        self._index_bytes += len(line)
+        return entry.episode
+
+    def finish(self) -> None:
+        """Closes the writer and vouches that the dataset is complete.
+
+        Raises:
+            RuntimeError: fewer episodes than the target were committed.
+        """
+        self.close()
+        if not self.complete:
+            got = f"{self.num_episodes} of {self.target_episodes} episodes"
+            raise RuntimeError(f"{self.path} holds {got}: append the rest before finish(), or leave with close().")
+
+    def close(self) -> None:
+        """Releases the files and the lock. What was appended is already on disk. Idempotent."""
+        descriptors = [*self._files.values(), *([self._index] if self._index >= 0 else [])]
+        self._files, self._index = {}, -1
+        for descriptor in descriptors:
+            os.close(descriptor)
+
+    def __enter__(self) -> EpisodeWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _lock(self) -> None:
+        # The lock belongs to the open file, so the kernel drops it when the process dies, however it dies.
+        try:
+            fcntl.flock(self._index, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RuntimeError(f"another writer has {self.path} open: wait for it or use another path.") from error
+
+    def _begin(self, shapes: dict[str, tuple[int, ...]]) -> None:
+        # meta.json comes last: a directory that has one has all its files.
+        self._open_data()
+        self._truncate()
+        header = Header(self.target_episodes, shapes, self.meta)
+        write_header(self.path, header)
+        self._header = header
+
+    def _resume(self) -> None:
+        header = Header.from_json((self.path / META_FILE).read_text(), self.path / META_FILE)
+        self._check_meta(header)
+        index_file = self.path / INDEX_FILE
+        entries, self._index_bytes = parse_index(index_file.read_bytes(), index_file)
+        if entries:
+            self.num_episodes, self.num_steps = entries[-1].episode, entries[-1].stop
+        check_sizes(self.path, header, self.num_steps)
+        self._open_data()
+        self._header = header
+        self._truncate()
+        if self.target_episodes != header.target_episodes:
+            self._header = header.with_target(self.target_episodes)
+            write_header(self.path, self._header)
+
+    def _check_meta(self, header: Header) -> None:
+        for name in sorted(set(header.meta) | set(self.meta)):
+            old, new = (json.dumps(meta[name]) if name in meta else "nothing" for meta in (header.meta, self.meta))
+            if old != new:
+                raise ValueError(
+                    f"{self.path} was begun with {name} = {old}, got {new}: repeat the first settings, or use another "
+                    "directory."
+                )
+        if self.target_episodes < header.target_episodes:
+            raise ValueError(
+                f"{self.path} was begun with target_episodes = {header.target_episodes}, got {self.target_episodes}: "
+                "a target may only grow."
+            )
+
+    def _open_data(self) -> None:
+        for key in DTYPES.keys() - self._files.keys():
+            flags = os.O_RDWR | os.O_CREAT | os.O_APPEND
+            self._files[key] = os.open(data_file(self.path, key), flags, 0o644)
+        sync_directory(self.path)
+
+    def _truncate(self) -> None:
+        """Cuts the index, then the data, back to the last committed episode."""
+        os.ftruncate(self._index, self._index_bytes)
+        for key, descriptor in self._files.items():
+            os.ftruncate(descriptor, self.num_steps * self._header.row_bytes(key) if self._header else 0)
+
+
+def estimate_bytes(num_steps: int, image_size: int | tuple[int, int], action_dim: int, state_dim: int) -> int:
+    """Disk space that ``num_steps`` rows take, in bytes.
+
+    Args:
+        num_steps: rows over all episodes.
+        image_size: pixels of a side, or (height, width).
+        action_dim: A.
+        state_dim: S.
+
+    Examples:
+        >>> estimate_bytes(10_000, 64, action_dim=2, state_dim=4)  # 123 MB
+        123280000
+    """
+    height, width = (image_size, image_size) if isinstance(image_size, int) else image_size
+    row = {PIXELS: (3, height, width), ACTION: (action_dim,), STATE: (state_dim,)}
+    return num_steps * sum(DTYPES[key].itemsize * prod(shape) for key, shape in row.items())
+
+
+def _to_builtin(value: Any) -> Any:
+    """JSON form of numpy arrays, numpy scalars and paths."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"meta must hold what JSON can, got a {type(value).__name__}: convert it first.")

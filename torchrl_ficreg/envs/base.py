@@ -1,0 +1,205 @@
+"""The goal protocol: what every environment of the package looks like from outside.
+
+One scene, two states: the current one and the goal. Both are observed as a picture and as the full simulator state,
+so that a planner may look only at pictures while an evaluation restores any recorded state exactly.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from torchrl_ficreg.data.schema import GOAL_PIXELS, PIXELS, STATE, SUCCESS
+
+GOAL_STATE = "goal_state"
+
+
+class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
+    """Base class of goal-conditioned environments with pictures and restorable states.
+
+    Observation: ``pixels`` and ``goal_pixels`` [3, image_size, image_size] uint8, ``state`` and ``goal_state`` [S]
+    float64. Reward: 1 when the goal is reached, 0 otherwise. Info: ``success`` [1] bool, at reset too. An episode
+    terminates at success if asked to and is never truncated here: limits are a wrapper's business.
+
+    ``reset(options={"state": s, "goal_state": g})`` starts from exactly these states; either may be left out and is
+    then drawn from the task's own distribution.
+
+    A subclass sets ``action_space`` and ``state_space`` before it calls this constructor, and writes seven short
+    methods: :meth:`_sample_state`, :meth:`_sample_goal`, :meth:`_get_state`, :meth:`_set_state`,
+    :meth:`_step_physics`, :meth:`_draw` and :meth:`_is_success`. It may refuse states by :meth:`_why_illegal`, and a
+    simulator that already is in the state to be drawn saves a restoration by :meth:`_draw_current`.
+
+    Args:
+        image_size: height and width of the pictures, in pixels.
+        terminate_on_success: end the episode once the goal is reached.
+        render_mode: ``"rgb_array"``, or None where ``render`` is not used.
+
+    Raises:
+        ValueError: an argument out of range.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    #: bounds of the action, which the physics may or may not enforce
+    action_space: spaces.Box
+    #: bounds of the full simulator state, [S] float64
+    state_space: spaces.Box
+
+    def __init__(
+        self,
+        *,
+        image_size: int = 64,
+        terminate_on_success: bool = True,
+        render_mode: str | None = "rgb_array",
+    ) -> None:
+        if not isinstance(image_size, int) or image_size < 1:
+            raise ValueError(f"image_size must be a positive integer, got {image_size!r}.")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}.")
+        self.image_size = image_size
+        self.terminate_on_success = terminate_on_success
+        self.render_mode = render_mode
+        picture = spaces.Box(0, 255, (3, image_size, image_size), np.uint8)
+        self.observation_space = spaces.Dict(
+            {PIXELS: picture, GOAL_PIXELS: picture, STATE: self.state_space, GOAL_STATE: self.state_space}
+        )
+        self._goal_state: np.ndarray | None = None
+        self._goal_pixels: np.ndarray | None = None
+
+    # ------------------------------------------------------------------ the seven methods of a subclass
+
+    @abc.abstractmethod
+    def _sample_state(self, rng: np.random.Generator) -> np.ndarray:
+        """Draws a start: [S] float64."""
+
+    @abc.abstractmethod
+    def _sample_goal(self, rng: np.random.Generator, state: np.ndarray) -> np.ndarray:
+        """Draws a goal for an episode that begins at ``state`` [S]: [S] float64."""
+
+    @abc.abstractmethod
+    def _get_state(self) -> np.ndarray:
+        """Returns the full simulator state, [S] float64, as an array that later steps leave alone."""
+
+    @abc.abstractmethod
+    def _set_state(self, state: np.ndarray) -> None:
+        """Restores the simulator to ``state`` [S] such that :meth:`_get_state` returns the same bits."""
+
+    @abc.abstractmethod
+    def _step_physics(self, action: np.ndarray) -> None:
+        """Advances the simulator by one action, [A] float64 and finite."""
+
+    @abc.abstractmethod
+    def _draw(self, state: np.ndarray) -> np.ndarray:
+        """Draws the scene at ``state`` [S] into a new [3, image_size, image_size] uint8; leaves the simulator alone."""
+
+    @abc.abstractmethod
+    def _is_success(self, state: np.ndarray, goal_state: np.ndarray) -> bool:
+        """Tells whether ``state`` [S] reaches ``goal_state`` [S]."""
+
+    def _draw_current(self) -> np.ndarray:
+        """Draws the simulator as it stands into a new [3, image_size, image_size] uint8."""
+        return self._draw(self._get_state())
+
+    def _why_illegal(self, state: np.ndarray) -> str | None:
+        """Says why an episode cannot start or end at ``state`` [S], or returns None; the bounds by default."""
+        if np.all(state >= self.state_space.low) and np.all(state <= self.state_space.high):
+            return None
+        return f"it leaves the bounds {self.state_space.low.tolist()} to {self.state_space.high.tolist()}"
+
+    # ------------------------------------------------------------------ the Gymnasium interface
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Starts an episode.
+
+        Args:
+            seed: makes the draws of this and of the following resets reproducible.
+            options: ``"state"`` and ``"goal_state"``, [S] each, to start from and to reach; bit for bit when float64.
+
+        Returns:
+            the observation and the info, see the class.
+
+        Raises:
+            ValueError: unknown options, or a state of the wrong shape, not finite or not legal.
+        """
+        options = {} if options is None else options
+        unknown = set(options) - {STATE, GOAL_STATE}
+        if unknown:
+            raise ValueError(f"unknown reset options {sorted(unknown)}: use {STATE!r} and {GOAL_STATE!r}.")
+        # Checked before anything changes, so that a refused reset leaves the running episode intact.
+        given = {key: self._check_state(key, options[key]) for key in options}
+        super().reset(seed=seed)
+        state = given[STATE] if STATE in given else self._sample_state(self.np_random)
+        goal = given[GOAL_STATE] if GOAL_STATE in given else self._sample_goal(self.np_random, state)
+        self._set_state(state)
+        self._goal_state = goal
+        self._goal_pixels = self._draw(goal)  # the goal stays for the whole episode: one drawing is enough
+        return self._observe(), self._info(self._is_success(self._get_state(), goal))
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, np.ndarray]]:
+        """Takes one action.
+
+        Args:
+            action: [A], finite; what happens beyond the bounds is the physics' business.
+
+        Returns:
+            observation, reward, terminated, truncated (always False) and info, see the class.
+
+        Raises:
+            ValueError: a wrong shape or a value that is not finite.
+            gymnasium.error.ResetNeeded: no episode was started.
+        """
+        if self._goal_state is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step().")
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != self.action_space.shape:
+            raise ValueError(f"action must be {self.action_space.shape}, got {action.shape}: step takes one action.")
+        if not np.isfinite(action).all():
+            raise ValueError(f"action must be finite, got {action.tolist()}: look for the NaN in the policy.")
+        self._step_physics(action)
+        success = self._is_success(self._get_state(), self._goal_state)
+        terminated = success and self.terminate_on_success
+        return self._observe(), float(success), terminated, False, self._info(success)
+
+    def render(self) -> np.ndarray | None:
+        """Draws the scene for people and videos.
+
+        Returns:
+            [image_size, image_size, 3] uint8, or None without a render mode.
+        """
+        if self.render_mode is None:
+            return None
+        return np.ascontiguousarray(self._draw_current().transpose(1, 2, 0))
+
+    # ------------------------------------------------------------------ internals
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        # Copies of the goal: what a caller writes into an observation must not reach the next one.
+        return {
+            PIXELS: self._draw_current(),
+            GOAL_PIXELS: self._goal_pixels.copy(),
+            STATE: self._get_state(),
+            GOAL_STATE: self._goal_state.copy(),
+        }
+
+    @staticmethod
+    def _info(success: bool) -> dict[str, np.ndarray]:
+        return {SUCCESS: np.array([success])}  # an array: TorchRL's info reader takes no Python scalar
+
+    def _check_state(self, name: str, value: Any) -> np.ndarray:
+        state = np.array(value, dtype=np.float64)  # a copy: the caller's array stays his
+        if state.shape != self.state_space.shape:
+            raise ValueError(f"option {name!r} must have shape {self.state_space.shape}, got {state.shape}.")
+        if not np.isfinite(state).all():
+            raise ValueError(f"option {name!r} must be finite, got {state.tolist()}.")
+        reason = self._why_illegal(state)
+        if reason is not None:
+            raise ValueError(f"option {name!r} {state.tolist()} is not legal: {reason}.")
+        return state

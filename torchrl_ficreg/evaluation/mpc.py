@@ -1,0 +1,193 @@
+"""Does the planner reach the goals? Success rates on frozen start-goal pairs."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import step_mdp
+from tqdm import tqdm
+
+from torchrl_ficreg.data.schema import ACTION, GOAL_PIXELS, PIXELS, SUCCESS
+from torchrl_ficreg.envs import make_env
+from torchrl_ficreg.evaluation.pairs import StartGoalPairs
+from torchrl_ficreg.evaluation.statistics import wilson_interval
+from torchrl_ficreg.modules.planners.common import PLAN_SEED
+
+
+class UniformPolicy(TensorDictModuleBase):
+    """Actions drawn uniformly between the bounds: the floor every planner is compared with.
+
+    Each environment (``plan_seed`` [E], or 0, 1, ...) draws from a generator of its own.
+
+    Args:
+        low, high: [A], environment units.
+        seed: of the draws.
+    """
+
+    def __init__(self, low: list[float], high: list[float], seed: int = 0) -> None:
+        super().__init__()
+        self.low, self.high, self.seed = torch.tensor(low), torch.tensor(high), seed
+        self.in_keys, self.out_keys = [], [ACTION]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes ``action`` [E, A] and, under ``random_step``, how many were drawn."""
+        count = tensordict.get("random_step", torch.zeros(tensordict.batch_size, dtype=torch.long))
+        seeds = tensordict.get(PLAN_SEED, torch.arange(count.numel()).reshape(count.shape))
+        draws = [
+            np.random.default_rng([self.seed, seed, step]).random(len(self.low), dtype=np.float32)
+            for seed, step in zip(seeds.flatten().tolist(), count.flatten().tolist())
+        ]
+        unit = torch.from_numpy(np.stack(draws)).reshape(*count.shape, -1)  # [E, A] in [0, 1)
+        return tensordict.set(ACTION, self.low + (self.high - self.low) * unit).set("random_step", count + 1)
+
+
+@dataclass
+class Evaluation:
+    """Outcome of one policy on N start-goal pairs.
+
+    Attributes:
+        success: [N, budget + 1] bool, at the start and after every step.
+        seconds_per_plan: mean wall time of one plan of one environment; 0 for a policy that does not plan.
+        pairs_hash: of the pairs.
+        frames: recorded episodes, each [budget + 1, 3, H, W] uint8.
+        goals: their goals, each [3, H, W] uint8.
+    """
+
+    success: np.ndarray
+    seconds_per_plan: float
+    pairs_hash: str
+    frames: list[np.ndarray] = field(default_factory=list)
+    goals: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def ever(self) -> np.ndarray:
+        """[N] bool: in the goal after any step of the budget."""
+        return self.success[:, 1:].any(1)
+
+    @property
+    def at_start(self) -> np.ndarray:
+        """[N] bool: in the goal before the first step."""
+        return self.success[:, 0]
+
+    @property
+    def success_rate(self) -> float:
+        """Share of all pairs solved."""
+        return float(self.ever.mean())
+
+    def summary(self) -> dict[str, Any]:
+        """Plain JSON values; rates in 0..1, intervals by Wilson at 95 %."""
+        open_pairs = ~self.at_start
+        solved_open = self.ever[open_pairs]
+        first = np.where(self.ever, self.success[:, 1:].argmax(1) + 1, -1)
+        return {
+            "pairs": len(self.ever),
+            "pairs_hash": self.pairs_hash,
+            "budget": self.success.shape[1] - 1,
+            "success_rate": self.success_rate,
+            "success_interval": wilson_interval(int(self.ever.sum()), len(self.ever)),
+            "success_rate_at_end": float(self.success[:, -1].mean()),
+            "solved_at_start": int(self.at_start.sum()),
+            "success_rate_unsolved_at_start": float(solved_open.mean()) if len(solved_open) else None,
+            "seconds_per_plan": self.seconds_per_plan,
+            "first_success_step": first.tolist(),
+        }
+
+
+def evaluate_mpc(
+    policy: TensorDictModuleBase,
+    pairs: StartGoalPairs,
+    *,
+    budget: int = 50,
+    image_size: int = 64,
+    num_envs: int = 50,
+    num_workers: int | None = None,
+    env_kwargs: dict[str, Any] | None = None,
+    record: int = 0,
+    progress_bar: bool = True,
+    description: str = "evaluate",
+) -> Evaluation:
+    """Lets a policy act from every start state and counts the goals it reaches.
+
+    Episodes go on after success, so that reaching a goal and staying there are counted separately. An outcome does not
+    depend on ``num_envs``: the policy is told, by ``plan_seed``, which pair it acts for.
+
+    Args:
+        policy: reads ``pixels`` and ``goal_pixels``, writes ``action``.
+        pairs: starts and goals.
+        budget: environment steps allowed.
+        image_size: of the frames the policy sees.
+        num_envs: pairs evaluated side by side.
+        num_workers: see :func:`~torchrl_ficreg.envs.make_env`.
+        env_kwargs: further arguments of the environment.
+        record: number of episodes whose frames are kept.
+        progress_bar, description: of the progress bar.
+
+    Raises:
+        ValueError: a budget below 1.
+    """
+    if budget < 1 or num_envs < 1:
+        raise ValueError(f"budget and num_envs must be positive, got {budget} and {num_envs}.")
+    outcome = Evaluation(np.zeros((len(pairs), budget + 1), dtype=bool), 0.0, pairs.hash)
+    seconds, plans = 0.0, 0
+    bar = tqdm(total=len(pairs) * budget, desc=description, unit="step", disable=not progress_bar, dynamic_ncols=True)
+    for first in range(0, len(pairs), num_envs):
+        group = np.arange(first, min(first + num_envs, len(pairs)))
+        env = make_env(
+            pairs.env,
+            len(group),
+            image_size=image_size,
+            terminate_on_success=False,
+            num_workers=None if num_workers is None else len(group),
+            **(env_kwargs or {}),
+        )
+        try:
+            group_seconds, group_plans = _run_group(env, policy, pairs, group, outcome, record, bar)
+        finally:
+            env.close()
+        seconds, plans = seconds + group_seconds, plans + group_plans
+    bar.close()
+    outcome.seconds_per_plan = seconds / plans if plans else 0.0
+    return outcome
+
+
+def _run_group(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    pairs: StartGoalPairs,
+    group: np.ndarray,
+    outcome: Evaluation,
+    record: int,
+    bar: tqdm,
+) -> tuple[float, int]:
+    """Runs the pairs of one group side by side and fills in their rows; returns policy seconds and plans made."""
+    options = [{"state": pairs.start_state[i], "goal_state": pairs.goal_state[i]} for i in group]
+    if env.batch_size:
+        td = env.reset(list_of_kwargs=[{"options": option} for option in options])
+    else:
+        td = env.reset(options=options[0])
+    lead = td.batch_size
+    td[PLAN_SEED] = torch.from_numpy(group).reshape(lead)
+    kept = range(max(0, min(record - int(group[0]), len(group))))
+    frames = [td[PIXELS].reshape(len(group), *td[PIXELS].shape[-3:])[: len(kept)].numpy().copy()]
+    outcome.goals += list(td[GOAL_PIXELS].reshape(len(group), *td[PIXELS].shape[-3:])[: len(kept)].numpy().copy())
+    outcome.success[group, 0] = td[SUCCESS].reshape(-1).numpy()
+    seconds = 0.0
+    for step in range(1, outcome.success.shape[1]):
+        began = time.perf_counter()
+        td = policy(td)
+        seconds += time.perf_counter() - began
+        td = step_mdp(env.step(td), keep_other=True)
+        outcome.success[group, step] = td[SUCCESS].reshape(-1).numpy()
+        if kept:
+            frames.append(td[PIXELS].reshape(len(group), *td[PIXELS].shape[-3:])[: len(kept)].numpy().copy())
+        bar.update(len(group))
+    outcome.frames += [np.stack([frame[i] for frame in frames]) for i in kept]
+    plans = td.get(("mpc", "count"), None)
+    return seconds, 0 if plans is None else int(plans.sum())

@@ -1,0 +1,130 @@
+"""Start-goal pairs: drawn once from held-out episodes, then frozen."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_ficreg.data import OfflineTrajectories
+from torchrl_ficreg.data.schema import STATE
+
+
+@dataclass(frozen=True)
+class StartGoalPairs:
+    """N start states and, from the same episode some steps later, N goal states.
+
+    Attributes:
+        env: name of the environment.
+        goal_offset: environment steps from start to goal.
+        seed: of the draw.
+        fingerprint: of the dataset they were drawn from.
+        episode, step: [N], where each start was found.
+        start_state, goal_state: [N, S] float64, full simulator states.
+    """
+
+    env: str
+    goal_offset: int
+    seed: int
+    fingerprint: str
+    episode: np.ndarray
+    step: np.ndarray
+    start_state: np.ndarray
+    goal_state: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.episode)
+
+    @property
+    def hash(self) -> str:
+        """sha256 of everything above: two results with one hash were measured on the same pairs."""
+        return hashlib.sha256(json.dumps(self._content(), sort_keys=True).encode()).hexdigest()
+
+    @classmethod
+    def draw(cls, dataset: OfflineTrajectories, env: str, num_pairs: int, goal_offset: int, seed: int) -> StartGoalPairs:
+        """Draws pairs uniformly, without replacement, over all starts that have a goal in their episode.
+
+        Args:
+            dataset: held-out episodes.
+            env: name of their environment.
+            num_pairs: N.
+            goal_offset: environment steps from start to goal.
+            seed: of the draw.
+
+        Raises:
+            ValueError: fewer than N legal starts.
+        """
+        table = dataset.episodes
+        starts = (table["length"] - goal_offset).clamp_min(0).numpy()  # legal starts of each episode
+        total = int(starts.sum())
+        if num_pairs < 1 or goal_offset < 1 or num_pairs > total:
+            raise ValueError(
+                f"cannot draw {num_pairs} pairs {goal_offset} steps apart: the {dataset.split} episodes have {total} "
+                "such starts. Collect more episodes, or ask for fewer pairs."
+            )
+        picks = np.sort(np.random.default_rng(seed).choice(total, num_pairs, replace=False))
+        ends = np.cumsum(starts)
+        row = np.searchsorted(ends, picks, side="right")  # [N], row of the episode table
+        step = picks - (ends - starts)[row]
+        episode = table["episode"].numpy()[row]
+        states = [dataset.episode_data(int(e))[STATE].numpy()[[s, s + goal_offset]] for e, s in zip(episode, step)]
+        start_state, goal_state = np.stack(states, axis=1)  # each [N, S]
+        return cls(env, goal_offset, seed, dataset.fingerprint, episode, step, start_state, goal_state)
+
+    @classmethod
+    def frozen(
+        cls, path: Path, dataset: OfflineTrajectories, env: str, num_pairs: int, goal_offset: int, seed: int
+    ) -> StartGoalPairs:
+        """The pairs of a manifest; draws them and writes it when there is none.
+
+        Raises:
+            ValueError: the manifest belongs to another dataset or another draw, or was changed by hand.
+        """
+        if not path.exists():
+            pairs = cls.draw(dataset, env, num_pairs, goal_offset, seed)
+            pairs.save(path)
+            return pairs
+        pairs = cls.load(path)
+        wanted = (env, num_pairs, goal_offset, seed, dataset.fingerprint)
+        found = (pairs.env, len(pairs), pairs.goal_offset, pairs.seed, pairs.fingerprint)
+        if found != wanted:
+            raise ValueError(
+                f"{path} holds pairs of another draw or dataset (env, pairs, goal_offset, seed, fingerprint: {found}, "
+                f"expected {wanted}): move it away to draw new ones."
+            )
+        return pairs
+
+    def save(self, path: Path) -> None:
+        """Writes the manifest in one piece."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(path.name + ".part")
+        part.write_text(json.dumps({**self._content(), "hash": self.hash}, indent=1))
+        os.replace(part, path)
+
+    @classmethod
+    def load(cls, path: Path) -> StartGoalPairs:
+        """Reads a manifest.
+
+        Raises:
+            ValueError: it is not one, or its hash does not fit its content.
+        """
+        try:
+            content: dict[str, Any] = json.loads(Path(path).read_text())
+            stored = content.pop("hash")
+            arrays = {name: np.array(content.pop(name)) for name in ("episode", "step", "start_state", "goal_state")}
+            pairs = cls(**content, **arrays)
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} is not a manifest of start-goal pairs ({error!r}).") from error
+        if pairs.hash != stored:
+            raise ValueError(f"{path} was changed after it was drawn: its hash does not fit. Move it away to draw again.")
+        return pairs
+
+    def _content(self) -> dict[str, Any]:
+        # Floats survive: json writes the shortest text that reads back as the same double.
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}

@@ -1,0 +1,70 @@
+"""Convolutional encoder for small frames."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import nn
+
+from torchrl_ficreg.data.schema import LATENT, PIXELS
+from torchrl_ficreg.modules.pixels import PixelNormalizer, restore_lead
+from torchrl_ficreg.modules.projector import Projector
+
+
+class ConvNetwork(nn.Module):
+    """Strided 4x4 convolutions, each halving the frame, and a BatchNorm projector on what is left.
+
+    Args:
+        image_size: H = W of the frames, a multiple of 2 ** len(channels).
+        channels: output channels of each convolution.
+        projector_dim: hidden width of the projector.
+        latent_dim: D.
+    """
+
+    def __init__(
+        self,
+        *,
+        image_size: int = 64,
+        channels: tuple[int, ...] = (32, 64, 128, 256),
+        projector_dim: int = 128,
+        latent_dim: int = 16,
+    ) -> None:
+        super().__init__()
+        if image_size % 2 ** len(channels):
+            raise ValueError(f"image_size {image_size} must be a multiple of {2 ** len(channels)}, one halving a layer.")
+        self.normalize = PixelNormalizer(image_size)
+        layers: list[nn.Module] = []
+        for into, out in zip((3, *channels), channels):
+            layers += [nn.Conv2d(into, out, kernel_size=4, stride=2, padding=1), nn.GELU()]
+        self.convolutions = nn.Sequential(*layers)
+        left = image_size // 2 ** len(channels)
+        self.projector = Projector(channels[-1] * left**2, projector_dim, latent_dim)
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        """[..., 3, H, W] -> [..., D]."""
+        frames = self.normalize(pixels)  # [N, 3, H, W]
+        return restore_lead(self.projector(self.convolutions(frames).flatten(1)), pixels)
+
+
+class ConvEncoder(TensorDictModule):
+    """Encoder for small frames: ``pixels`` [..., 3, H, W] -> ``latent`` [..., D]. 1.2 M parameters, made for CPUs.
+
+    Args:
+        in_key, out_key: where frames are read and latents are written.
+        **network: see :class:`ConvNetwork`.
+
+    Raises:
+        TypeError, ValueError: see :class:`~torchrl_ficreg.modules.pixels.PixelNormalizer`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> encoder = ConvEncoder(latent_dim=8).eval()
+        >>> clip = TensorDict({"pixels": torch.rand(2, 4, 3, 64, 64)}, [2, 4])
+        >>> encoder(clip)["latent"].shape
+        torch.Size([2, 4, 8])
+    """
+
+    def __init__(self, *, in_key: NestedKey = PIXELS, out_key: NestedKey = LATENT, **network) -> None:
+        super().__init__(ConvNetwork(**network), in_keys=[in_key], out_keys=[out_key])

@@ -1,0 +1,52 @@
+"""From stored frames to what an encoder network eats."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class PixelNormalizer(nn.Module):
+    """Frames [..., 3, H, W] to normalised floats [N, 3, H, W], on the device they are on.
+
+    Args:
+        image_size: H = W that the network is built for.
+
+    Raises:
+        TypeError: pixels are neither uint8 (0..255) nor floating (0..1).
+        ValueError: pixels have another shape.
+    """
+
+    def __init__(self, image_size: int) -> None:
+        super().__init__()
+        self.image_size = image_size
+        std = torch.tensor(IMAGENET_STD).view(3, 1, 1)
+        mean = torch.tensor(IMAGENET_MEAN).view(3, 1, 1)
+        # Kept as constants of the network, not of its state: a checkpoint holds what was learned.
+        self.register_buffer("shift", -mean / std, persistent=False)
+        self.register_buffer("scale", 1 / std, persistent=False)
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        """[..., 3, H, W] uint8 in 0..255 or floating in 0..1 -> [N, 3, H, W] in the parameters' dtype."""
+        size = (3, self.image_size, self.image_size)
+        if pixels.shape[-3:] != size:
+            raise ValueError(
+                f"pixels must be [..., {size[0]}, {size[1]}, {size[2]}] (channels first), got {list(pixels.shape)}: "
+                "permute the channels, or build the encoder with another image_size."
+            )
+        if pixels.dtype == torch.uint8:
+            scale = self.scale / 255
+        elif pixels.is_floating_point():
+            scale = self.scale
+        else:
+            raise TypeError(f"pixels must be uint8 (0..255) or floating (0..1), got {pixels.dtype}: convert them.")
+        frames = pixels.flatten(0, -4) if pixels.ndim > 3 else pixels[None]  # [N, 3, H, W]
+        return frames.to(scale.dtype) * scale + self.shift
+
+
+def restore_lead(latent: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    """[N, D] -> [..., D] with the leading dimensions of pixels [..., 3, H, W]."""
+    return latent.unflatten(0, pixels.shape[:-3]) if pixels.ndim > 3 else latent[0]

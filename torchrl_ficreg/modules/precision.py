@@ -1,0 +1,36 @@
+"""Numeric precision, chosen by what the device is good at."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+
+Precision = Literal["auto", "fp32", "bf16"]
+
+
+def has_fast_bf16(device: torch.device | str) -> bool:
+    """Whether bfloat16 matrix products are faster than float32 ones: AMX processors, CUDA from Ampere on."""
+    device = torch.device(device)
+    if device.type == "cuda":
+        return torch.cuda.get_device_capability(device)[0] >= 8
+    if device.type == "cpu":
+        return bool(getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)())
+    return False
+
+
+def autocast(device: torch.device | str, precision: Precision = "auto") -> torch.autocast:
+    """A bfloat16 autocast region on the device, or none.
+
+    Args:
+        device: where the tensors are.
+        precision: ``"bf16"``, ``"fp32"``, or ``"auto"``: bfloat16 where :func:`has_fast_bf16` says so.
+
+    Raises:
+        ValueError: an unknown precision.
+    """
+    if precision not in ("auto", "fp32", "bf16"):
+        raise ValueError(f"unknown precision {precision!r}: choose 'auto', 'fp32' or 'bf16'.")
+    device = torch.device(device)
+    enabled = precision == "bf16" or (precision == "auto" and has_fast_bf16(device))
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled)

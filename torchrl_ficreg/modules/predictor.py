@@ -1,0 +1,171 @@
+"""Action-conditioned causal predictor: the dynamics of the world model."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import nn
+
+from torchrl_ficreg.data.schema import ACTION, LATENT, PREDICTED_LATENT
+from torchrl_ficreg.modules.projector import Projector
+from torchrl_ficreg.modules.transformer import AdaptiveBlock
+
+
+class ActionEmbedding(nn.Module):
+    """Two-layer embedding of an action block, after a narrow linear bottleneck (arXiv 2603.19312).
+
+    Args:
+        action_dim: width F * A of an action block.
+        width: of the embedding.
+        bottleneck: width the block is first mapped to.
+    """
+
+    def __init__(self, action_dim: int, width: int, bottleneck: int = 10) -> None:
+        super().__init__()
+        self.action_dim = action_dim
+        self.compress = nn.Linear(action_dim, bottleneck)
+        self.layer_in = nn.Linear(bottleneck, 4 * width)
+        self.layer_out = nn.Linear(4 * width, width)
+        self.activation = nn.SiLU()
+
+    def forward(self, action: torch.Tensor) -> torch.Tensor:
+        """Action blocks [..., F * A], z-scored -> [..., width].
+
+        Raises:
+            ValueError: the blocks have another width.
+        """
+        if action.shape[-1] != self.action_dim:
+            raise ValueError(
+                f"action blocks must be {self.action_dim} wide (frame skip x raw action dimension), got "
+                f"{action.shape[-1]}: check frame_skip and the environment the model was built for."
+            )
+        return self.layer_out(self.activation(self.layer_in(self.compress(action))))
+
+
+class ActionEncoder(TensorDictModule):
+    """``action`` [..., F * A] -> ``action_embedding`` [..., width].
+
+    The predictor holds one of these networks of its own; this module is for using the embedding elsewhere.
+
+    Examples:
+        >>> import torch
+        >>> ActionEncoder(action_dim=10, width=32)(action=torch.zeros(4, 10)).shape
+        torch.Size([4, 32])
+    """
+
+    def __init__(
+        self,
+        action_dim: int,
+        width: int,
+        bottleneck: int = 10,
+        *,
+        in_key: NestedKey = ACTION,
+        out_key: NestedKey = "action_embedding",
+    ) -> None:
+        super().__init__(ActionEmbedding(action_dim, width, bottleneck), in_keys=[in_key], out_keys=[out_key])
+
+
+class CausalTransformer(nn.Module):
+    """Predicts each next latent from the latents so far and the action block that leads on.
+
+    Args:
+        latent_dim: D.
+        action_dim: width F * A of an action block.
+        history: H, the longest window of latents it sees.
+        width, depth, heads, dim_head, mlp_dim, dropout: of the transformer.
+        projector_dim: hidden width of the BatchNorm projector at its end.
+        action_bottleneck: see :class:`ActionEmbedding`.
+    """
+
+    def __init__(
+        self,
+        *,
+        latent_dim: int = 192,
+        action_dim: int,
+        history: int = 3,
+        width: int = 192,
+        depth: int = 6,
+        heads: int = 16,
+        dim_head: int = 64,
+        mlp_dim: int = 2048,
+        dropout: float = 0.1,
+        projector_dim: int = 2048,
+        action_bottleneck: int = 10,
+    ) -> None:
+        super().__init__()
+        self.history, self.latent_dim, self.action_dim = history, latent_dim, action_dim
+        self.action_embedding = ActionEmbedding(action_dim, width, action_bottleneck)
+        self.to_width = nn.Identity() if latent_dim == width else nn.Linear(latent_dim, width)
+        self.position = nn.Parameter(0.02 * torch.randn(1, history, width))
+        self.blocks = nn.ModuleList(AdaptiveBlock(width, heads, dim_head, mlp_dim, dropout) for _ in range(depth))
+        self.norm = nn.LayerNorm(width)
+        self.projector = Projector(width, projector_dim, latent_dim)
+
+    def modulation(self, action: torch.Tensor) -> torch.Tensor:
+        """Action blocks [..., T, F * A] -> modulation of every layer [depth, ..., T, 6 * width].
+
+        It depends on the actions alone, so a planner computes it once and slides its window over the result.
+        """
+        condition = self.action_embedding(action)  # [..., T, width]
+        return torch.stack([block.modulation(condition) for block in self.blocks])
+
+    def step(self, latent: torch.Tensor, modulation: torch.Tensor) -> torch.Tensor:
+        """Latents [N, T, D] and modulation [depth, N, T, 6 * width] -> next latents [N, T, D], T at most H."""
+        tokens = self.to_width(latent) + self.position[:, : latent.shape[-2]]  # [N, T, width]
+        for block, block_modulation in zip(self.blocks, modulation):
+            tokens = block(tokens, block_modulation)
+        return self.projector(self.norm(tokens))
+
+    def forward(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Latents [..., T, D] and the action blocks that lead on from them [..., T, F * A] -> [..., T, D].
+
+        Raises:
+            ValueError: more than H latents, or other widths than the network was built for.
+        """
+        lead, tokens = latent.shape[:-2], latent.shape[-2]
+        if not 1 <= tokens <= self.history:
+            raise ValueError(
+                f"the predictor sees 1 to {self.history} latents, got {tokens}: "
+                f"give clips of {self.history + 1} frames, or build it with history={tokens}."
+            )
+        if latent.shape[-1] != self.latent_dim:
+            raise ValueError(f"latents must be {self.latent_dim} wide, got {latent.shape[-1]}.")
+        latent, action = latent.reshape(-1, *latent.shape[-2:]), action.reshape(-1, *action.shape[-2:])
+        return self.step(latent, self.modulation(action)).reshape(*lead, tokens, -1)
+
+
+class CausalPredictor(TensorDictModule):
+    """``latent`` [..., T, D] and ``action`` [..., T, F * A] -> ``predicted_latent`` [..., T, D].
+
+    Row t of the output predicts the latent one frame after row t of the input. AdaLN-zero conditioning on the action,
+    causal attention over at most H latents, dropout, BatchNorm projection. The defaults are the paper's
+    (arXiv 2603.19312): 11.7 M parameters.
+
+    Args:
+        in_keys, out_key: where latents and action blocks are read, and predictions written.
+        **network: see :class:`CausalTransformer`.
+
+    Raises:
+        ValueError: more than H latents, or a wrong width.
+
+    Examples:
+        >>> import torch
+        >>> predictor = CausalPredictor(latent_dim=16, action_dim=10, history=3, depth=1).eval()
+        >>> predictor(latent=torch.zeros(2, 3, 16), action=torch.zeros(2, 3, 10)).shape
+        torch.Size([2, 3, 16])
+    """
+
+    def __init__(
+        self,
+        *,
+        in_keys: tuple[NestedKey, NestedKey] = (LATENT, ACTION),
+        out_key: NestedKey = PREDICTED_LATENT,
+        **network,
+    ) -> None:
+        super().__init__(CausalTransformer(**network), in_keys=list(in_keys), out_keys=[out_key])
+
+    @property
+    def history(self) -> int:
+        """H, the longest window of latents the predictor sees."""
+        return self.module.history

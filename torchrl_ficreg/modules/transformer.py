@@ -1,0 +1,121 @@
+"""The only attention and adaptive-normalisation blocks of the package.
+
+``Block`` is the pre-norm block of a vision transformer; ``AdaptiveBlock`` is the same with shift, scale and gate
+given from outside (AdaLN-zero), as the predictor needs it. Shapes: N rows, T tokens, C channels.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+
+def attend(query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: bool) -> torch.Tensor:
+    """Softmax attention by the kernel that is fastest on the device at hand.
+
+    The fused kernel wins on CUDA. On CPUs its backward pass costs twice that of two plain matrix products around
+    a softmax, and on windows of a few tokens its forward does too, so plain products are used there.
+
+    Args:
+        query, key, value: [N, heads, T, dim_head], any floating dtype.
+        causal: a token sees itself and earlier ones only.
+
+    Returns:
+        [N, heads, T, dim_head].
+    """
+    if query.device.type != "cpu":
+        return F.scaled_dot_product_attention(query, key, value, is_causal=causal)
+    scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)  # [N, heads, T, T]
+    if causal:
+        tokens = scores.shape[-1]
+        future = torch.ones(tokens, tokens, dtype=torch.bool, device=scores.device).triu(1)  # [T, T]
+        scores = scores.masked_fill(future, -torch.inf)
+    return scores.softmax(-1).to(value.dtype) @ value
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention.
+
+    Args:
+        dim: channels C of the tokens.
+        heads, dim_head: number and width of the heads.
+        causal: a token sees itself and earlier ones only.
+        qkv_bias: bias of the query, key and value projection.
+        dropout: after the output projection.
+    """
+
+    def __init__(
+        self, dim: int, heads: int, dim_head: int, *, causal: bool, qkv_bias: bool, dropout: float = 0.0
+    ) -> None:
+        super().__init__()
+        self.heads, self.causal = heads, causal
+        self.inner = heads * dim_head
+        self.to_qkv = nn.Linear(dim, 3 * self.inner, bias=qkv_bias)
+        self.to_out = nn.Linear(self.inner, dim)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """[N, T, C] -> [N, T, C]."""
+        if x.shape[-2] == 1:
+            # One token attends to itself alone: the softmax is 1 whatever query and key are.
+            bias = self.to_qkv.bias[2 * self.inner :] if self.to_qkv.bias is not None else None
+            mixed = F.linear(x, self.to_qkv.weight[2 * self.inner :], bias)  # [N, 1, inner]
+        else:
+            query, key, value = self.to_qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
+            mixed = attend(query, key, value, self.causal).transpose(1, 2).flatten(2)  # [N, T, inner]
+        return self.dropout(self.to_out(mixed))
+
+
+class FeedForward(nn.Sequential):
+    """Two linear layers with an exact GELU between them, [..., C] -> [..., C]."""
+
+    def __init__(self, dim: int, hidden: int, dropout: float = 0.0) -> None:
+        super().__init__(
+            nn.Linear(dim, hidden), nn.GELU(), nn.Dropout(dropout), nn.Linear(hidden, dim), nn.Dropout(dropout)
+        )
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block, [N, T, C] -> [N, T, C]."""
+
+    def __init__(self, dim: int, heads: int, mlp_dim: int, eps: float = 1e-12) -> None:
+        super().__init__()
+        self.attn_norm = nn.LayerNorm(dim, eps=eps)
+        self.attn = Attention(dim, heads, dim // heads, causal=False, qkv_bias=True)
+        self.mlp_norm = nn.LayerNorm(dim, eps=eps)
+        self.mlp = FeedForward(dim, mlp_dim)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """[N, T, C] -> [N, T, C]."""
+        x = x + self.attn(self.attn_norm(x))
+        return x + self.mlp(self.mlp_norm(x))
+
+
+class AdaptiveBlock(nn.Module):
+    """Causal block whose normalisation is shifted, scaled and gated by a condition (AdaLN-zero, arXiv 2212.09748).
+
+    The modulation layer starts at zero, so the block starts as the identity. It depends on the condition alone:
+    :meth:`modulation` may be computed once and reused while the tokens change, as a planner does.
+    """
+
+    def __init__(self, dim: int, heads: int, dim_head: int, mlp_dim: int, dropout: float) -> None:
+        super().__init__()
+        self.adaptive_norm = nn.LayerNorm(dim, eps=1e-6, elementwise_affine=False)
+        self.to_modulation = nn.Linear(dim, 6 * dim)
+        nn.init.zeros_(self.to_modulation.weight)
+        nn.init.zeros_(self.to_modulation.bias)
+        self.attn_norm = nn.LayerNorm(dim)
+        self.attn = Attention(dim, heads, dim_head, causal=True, qkv_bias=False, dropout=dropout)
+        self.mlp_norm = nn.LayerNorm(dim)
+        self.mlp = FeedForward(dim, mlp_dim, dropout)
+
+    def modulation(self, condition: torch.Tensor) -> torch.Tensor:
+        """Condition [N, T, C] -> shift, scale and gate of both branches [N, T, 6C]."""
+        return self.to_modulation(F.silu(condition))
+
+    def forward(self, x: torch.Tensor, modulation: torch.Tensor) -> torch.Tensor:
+        """Tokens [N, T, C] and modulation [N, T, 6C] -> [N, T, C]."""
+        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.chunk(6, dim=-1)  # each [N, T, C]
+        x = x + gate_a * self.attn(self.attn_norm(self.adaptive_norm(x) * (1 + scale_a) + shift_a))
+        return x + gate_m * self.mlp(self.mlp_norm(self.adaptive_norm(x) * (1 + scale_m) + shift_m))

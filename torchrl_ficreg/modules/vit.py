@@ -1,0 +1,84 @@
+"""Vision transformer encoder (ViT-Tiny/14 in the paper)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import nn
+
+from torchrl_ficreg.data.schema import LATENT, PIXELS
+from torchrl_ficreg.modules.pixels import PixelNormalizer, restore_lead
+from torchrl_ficreg.modules.projector import Projector
+from torchrl_ficreg.modules.transformer import Block
+
+
+class VisionTransformer(nn.Module):
+    """Class-token vision transformer (arXiv 2010.11929) with a BatchNorm projector on the class token.
+
+    Args:
+        image_size, patch_size: H = W of the frames and of one patch, in pixels.
+        width, depth, heads, mlp_dim: of the transformer.
+        projector_dim: hidden width of the projector.
+        latent_dim: D.
+    """
+
+    def __init__(
+        self,
+        *,
+        image_size: int = 224,
+        patch_size: int = 14,
+        width: int = 192,
+        depth: int = 12,
+        heads: int = 3,
+        mlp_dim: int = 768,
+        projector_dim: int = 2048,
+        latent_dim: int = 192,
+    ) -> None:
+        super().__init__()
+        if image_size % patch_size:
+            raise ValueError(f"image_size {image_size} must be a multiple of patch_size {patch_size}.")
+        self.patch_size = patch_size
+        num_patches = (image_size // patch_size) ** 2
+        self.normalize = PixelNormalizer(image_size)
+        self.to_patch = nn.Linear(3 * patch_size**2, width)
+        self.class_token = nn.Parameter(0.02 * torch.randn(1, 1, width))
+        self.position = nn.Parameter(0.02 * torch.randn(1, num_patches + 1, width))
+        self.blocks = nn.ModuleList(Block(width, heads, mlp_dim) for _ in range(depth))
+        self.norm = nn.LayerNorm(width, eps=1e-12)
+        self.projector = Projector(width, projector_dim, latent_dim)
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        """[..., 3, H, W] -> [..., D]."""
+        frames = self.normalize(pixels)  # [N, 3, H, W]
+        patches = frames.unfold(2, self.patch_size, self.patch_size).unfold(3, self.patch_size, self.patch_size)
+        tokens = self.to_patch(patches.permute(0, 2, 3, 1, 4, 5).flatten(3).flatten(1, 2))  # [N, P, width]
+        tokens = torch.cat([self.class_token.expand(len(tokens), -1, -1), tokens], dim=1) + self.position
+        for block in self.blocks:
+            tokens = block(tokens)  # [N, P + 1, width]
+        return restore_lead(self.projector(self.norm(tokens[:, 0])), pixels)
+
+
+class ViTEncoder(TensorDictModule):
+    """Encoder for large frames: ``pixels`` [..., 3, H, W] -> ``latent`` [..., D].
+
+    The defaults are the paper's ViT-Tiny/14 at 224 pixels (arXiv 2603.19312): 6.3 M parameters with its projector.
+
+    Args:
+        in_key, out_key: where frames are read and latents are written.
+        **network: see :class:`VisionTransformer`.
+
+    Raises:
+        TypeError, ValueError: see :class:`~torchrl_ficreg.modules.pixels.PixelNormalizer`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> encoder = ViTEncoder(image_size=28, depth=1).eval()
+        >>> clip = TensorDict({"pixels": torch.zeros(2, 4, 3, 28, 28, dtype=torch.uint8)}, [2, 4])
+        >>> encoder(clip)["latent"].shape
+        torch.Size([2, 4, 192])
+    """
+
+    def __init__(self, *, in_key: NestedKey = PIXELS, out_key: NestedKey = LATENT, **network) -> None:
+        super().__init__(VisionTransformer(**network), in_keys=[in_key], out_keys=[out_key])

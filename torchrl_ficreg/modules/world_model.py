@@ -1,0 +1,127 @@
+"""The latent world model: encode, predict, rollout."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_ficreg.data.schema import ACTION, LATENT, PIXELS, PREDICTED_LATENT
+from torchrl_ficreg.data.statistics import ActionStatistics
+from torchrl_ficreg.modules.predictor import CausalPredictor
+
+
+class LatentWorldModel(TensorDictModuleBase):
+    """Encoder and predictor as one thing to plan with. It knows no loss, no cost and no environment.
+
+    The action statistics are part of its state: whoever holds the model can translate between environment actions
+    and the z-scored action blocks it was trained on, without the dataset.
+
+    Args:
+        encoder: reads ``pixels`` [..., 3, H, W], writes ``latent`` [..., D].
+        predictor: reads ``latent`` and ``action``, writes ``predicted_latent``.
+        frame_skip: F, raw actions in one block.
+        statistics: mean and std [A] of raw actions; zeros and ones when none are given.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_ficreg import CausalPredictor, ConvEncoder, LatentWorldModel
+        >>> predictor = CausalPredictor(latent_dim=16, action_dim=10, history=1, depth=1)
+        >>> model = LatentWorldModel(ConvEncoder(), predictor, frame_skip=5).eval()
+        >>> latent = model.encode(torch.zeros(7, 3, 64, 64, dtype=torch.uint8))
+        >>> model.rollout(latent[:, None], torch.zeros(7, 4, 10)).shape
+        torch.Size([7, 4, 16])
+    """
+
+    def __init__(
+        self,
+        encoder: TensorDictModuleBase,
+        predictor: CausalPredictor,
+        *,
+        frame_skip: int,
+        statistics: ActionStatistics | None = None,
+    ) -> None:
+        super().__init__()
+        block = predictor.module.action_dim
+        if block % frame_skip:
+            raise ValueError(f"an action block of width {block} is no multiple of frame_skip {frame_skip}.")
+        self.encoder, self.predictor, self.frame_skip = encoder, predictor, frame_skip
+        self.in_keys, self.out_keys = [PIXELS, ACTION], [LATENT, PREDICTED_LATENT]
+        self.register_buffer("action_mean", torch.zeros(block // frame_skip))
+        self.register_buffer("action_std", torch.ones(block // frame_skip))
+        if statistics is not None:
+            self.statistics = statistics
+
+    @property
+    def history(self) -> int:
+        """H, the longest window of latents the predictor sees."""
+        return self.predictor.history
+
+    @property
+    def statistics(self) -> ActionStatistics:
+        """Mean and std [A] of raw actions in the training episodes."""
+        return ActionStatistics(self.action_mean, self.action_std)
+
+    @statistics.setter
+    def statistics(self, value: ActionStatistics) -> None:
+        if value.mean.shape != self.action_mean.shape:
+            raise ValueError(
+                f"the model acts in {len(self.action_mean)} dimensions, the statistics have {len(value.mean)}: "
+                "they belong to another environment."
+            )
+        self.action_mean.copy_(value.mean)
+        self.action_std.copy_(value.std)
+
+    def encode(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Frames [..., 3, H, W], uint8 or floats in 0..1 -> latents [..., D]."""
+        return self.encoder.module(pixels)
+
+    def predict(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Latents [..., T, D] and the z-scored action blocks leading on [..., T, F * A] -> next latents [..., T, D]."""
+        return self.predictor.module(latent, action)
+
+    def rollout(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Imagines where a sequence of action blocks leads, feeding predictions back.
+
+        The window grows from the context to H latents and then slides; positions count from its oldest latent, as in
+        training.
+
+        Args:
+            latent: context [..., C, D], oldest first.
+            action: z-scored action blocks [..., C - 1 + N, F * A]: those executed between the context frames, then
+                those to be imagined.
+
+        Returns:
+            predicted latents [..., N, D].
+
+        Raises:
+            ValueError: no block to imagine, or leading dimensions that differ.
+        """
+        context, blocks = latent.shape[-2], action.shape[-2]
+        steps = blocks - context + 1
+        if context < 1 or steps < 1 or latent.shape[:-2] != action.shape[:-2]:
+            raise ValueError(
+                f"rollout takes latents [..., C, D] and C - 1 + N action blocks [..., C - 1 + N, F * A], "
+                f"got {list(latent.shape)} and {list(action.shape)}."
+            )
+        network, lead = self.predictor.module, latent.shape[:-2]
+        window = list(latent.reshape(-1, context, latent.shape[-1]).unbind(1))  # C x [N, D]
+        modulation = network.modulation(action.reshape(-1, blocks, action.shape[-1]))  # [depth, N, blocks, 6 * width]
+        for end in range(context, context + steps):
+            start = max(0, end - self.history)
+            seen = torch.stack(window[start:end], dim=1)  # [N, T, D], T <= H
+            window.append(network.step(seen, modulation[:, :, start:end])[:, -1])
+        return torch.stack(window[context:], dim=1).reshape(*lead, steps, -1)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Encodes a clip and predicts every frame but its first from those before it.
+
+        Args:
+            tensordict: ``pixels`` [..., T, 3, H, W] and z-scored ``action`` [..., T, F * A]; left as it is.
+
+        Returns:
+            a new tensordict with ``latent`` [..., T, D] and ``predicted_latent`` [..., T - 1, D].
+        """
+        latent = self.encode(tensordict.get(PIXELS))
+        predicted = self.predict(latent[..., :-1, :], tensordict.get(ACTION)[..., :-1, :])
+        return TensorDict({LATENT: latent, PREDICTED_LATENT: predicted}, latent.shape[:-2])

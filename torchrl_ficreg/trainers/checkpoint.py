@@ -1,0 +1,89 @@
+"""What a world model's checkpoint holds, and how to get a usable model out of one."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
+
+from torchrl_ficreg.modules.inverse import InverseDynamicsModel
+from torchrl_ficreg.modules.presets import make_world_model, ModelConfig
+from torchrl_ficreg.modules.world_model import LatentWorldModel
+
+CHECKPOINTS = "checkpoints"
+_CARD, _MODEL, _INVERSE = "card", "world_model", "inverse_model"
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """What one must know about a model to use it without its dataset, as plain JSON values.
+
+    Attributes:
+        model: fields of :class:`ModelConfig`.
+        env: name of the environment it was trained on.
+        env_kwargs: how that environment was made.
+        action_low, action_high: bounds of a raw action [A], environment units.
+        config: the whole resolved configuration of the run that made it.
+    """
+
+    model: dict[str, Any]
+    env: str
+    env_kwargs: dict[str, Any]
+    action_low: list[float]
+    action_high: list[float]
+    config: dict[str, Any]
+
+    @property
+    def action_dim(self) -> int:
+        """A, raw action dimension."""
+        return len(self.action_low)
+
+
+def checkpoint_components(
+    model: LatentWorldModel, inverse_model: InverseDynamicsModel, card: ModelCard
+) -> dict[str, Any]:
+    """The components by which :func:`load_world_model` finds a model in a trainer's checkpoint."""
+    return {_MODEL: model, _INVERSE: inverse_model, _CARD: asdict(card)}
+
+
+def find_checkpoint(path: Path | str) -> Path:
+    """The checkpoint a user means: a checkpoint itself, or the latest of a run directory.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    path = Path(path).expanduser()
+    if Checkpoint.is_checkpoint(path):
+        return path
+    for directory in (path / CHECKPOINTS, path):
+        latest = CheckpointRotation(directory, keep_last=1).latest() if directory.is_dir() else None
+        if latest is not None:
+            return latest
+    raise FileNotFoundError(f"no checkpoint at {path}: give a run directory that train.py made, or a checkpoint in it.")
+
+
+def load_world_model(path: Path | str) -> tuple[LatentWorldModel, InverseDynamicsModel, ModelCard]:
+    """Builds the networks a checkpoint describes and loads their weights and action statistics.
+
+    Args:
+        path: a run directory, or one checkpoint.
+
+    Returns:
+        the world model and its inverse dynamics model, in eval mode on the CPU, and the card.
+
+    Raises:
+        FileNotFoundError: no checkpoint there.
+        ValueError: a checkpoint of another kind, or one whose parts do not fit together.
+    """
+    path = find_checkpoint(path)
+    try:
+        values = Checkpoint(card={}).load(path, components=[_CARD]).values
+        card = ModelCard(**values[_CARD])
+        model, inverse_model = make_world_model(ModelConfig(**card.model), card.action_dim)
+        parts = {_MODEL: model, _INVERSE: inverse_model}
+        Checkpoint(**parts).load(path, components=list(parts))
+    except (CheckpointError, TypeError, KeyError) as error:
+        raise ValueError(f"{path} is not a whole checkpoint of a world model ({error}).") from error
+    return model.eval(), inverse_model.eval(), card

@@ -1,0 +1,159 @@
+"""Hooks that any TorchRL trainer can register: metrics table, validation and progress bar."""
+
+from __future__ import annotations
+
+import csv
+import os
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import ReplayBuffer
+from torchrl.trainers import Trainer, TrainerHookBase
+from tqdm import tqdm
+
+from torchrl_ficreg.modules.precision import autocast, Precision
+
+
+class MetricsTable(TrainerHookBase):
+    """Writes one row of ``metrics.csv`` every few steps and hands the numbers to the trainer's logger.
+
+    Columns are fixed by the first row. A resumed run drops the rows that were written after its checkpoint.
+
+    Args:
+        path: the CSV file, or None for the logger alone.
+        interval: steps between rows.
+        last_step: steps of the whole run; the last one always gets a row.
+    """
+
+    def __init__(self, path: Path | None, interval: int, last_step: int) -> None:
+        self.path, self.interval, self.last_step = path, interval, last_step
+        self._since = (time.perf_counter(), 0)
+
+    def __call__(self, optim_steps: int, losses: TensorDictBase) -> dict[str, float] | None:
+        """Called after every optimisation step."""
+        if optim_steps % self.interval and optim_steps != self.last_step:
+            return None
+        now, (then, before) = time.perf_counter(), self._since
+        self._since = (now, optim_steps)
+        row = {key: value.float().mean().item() for key, value in sorted(losses.items())}
+        row["learning_rate"] = self._trainer.optimizer.param_groups[0]["lr"]
+        row["steps_per_second"] = (optim_steps - before) / max(now - then, 1e-9)
+        self._write({"step": optim_steps, "split": "train", **row})
+        return row
+
+    def write_validation(self, step: int, terms: dict[str, float]) -> None:
+        """Adds a row of validation terms."""
+        self._write({"step": step, "split": "validation", **terms})
+
+    def _write(self, row: dict[str, Any]) -> None:
+        if self.path is None:
+            return
+        new = not self.path.exists()
+        with open(self.path, "a", newline="") as file:
+            columns = list(row) if new else self._columns()
+            writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
+            if new:
+                writer.writeheader()
+            writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
+
+    def _columns(self) -> list[str]:
+        with open(self.path, newline="") as file:
+            return next(csv.reader(file))
+
+    def drop_after(self, step: int) -> None:
+        """Removes rows of later steps, atomically."""
+        self._since = (time.perf_counter(), step)
+        if self.path is None or not self.path.exists():
+            return
+        with open(self.path, newline="") as file:
+            header, *rows = csv.reader(file)
+        kept = [row for row in rows if len(row) == len(header) and int(row[0]) <= step]
+        part = self.path.with_suffix(".part")
+        with open(part, "w", newline="") as file:
+            csv.writer(file).writerows([header, *kept])
+        os.replace(part, self.path)
+
+    def register(self, trainer: Trainer, name: str = "metrics_table") -> None:
+        """Registers after each optimisation step."""
+        self._trainer = trainer
+        trainer.register_op("post_optim_complete_log", self)
+
+
+class Validation(TrainerHookBase):
+    """Evaluates the loss on held-out clips every few steps, in eval mode.
+
+    The global random state is left as it was found, so that a run with validation trains as one without.
+
+    Args:
+        replay_buffer: clips of held-out episodes.
+        interval: steps between evaluations, usually an epoch.
+        batches: batches averaged over, the same ones each time.
+        precision: as in training.
+        table: where the terms are written.
+    """
+
+    def __init__(
+        self, replay_buffer: ReplayBuffer, interval: int, batches: int, precision: Precision, table: MetricsTable
+    ) -> None:
+        self.replay_buffer, self.interval, self.batches = replay_buffer, interval, batches
+        self.precision, self.table = precision, table
+
+    @torch.no_grad()
+    def __call__(self, batch: TensorDictBase) -> dict[str, float] | None:
+        """Called after every step."""
+        trainer, step = self._trainer, self._trainer._optim_count
+        if step % self.interval:
+            return None
+        loss = trainer.loss_module.eval()
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            self.replay_buffer.seek(0)
+            outputs = []
+            for _ in range(self.batches):
+                clip = self.replay_buffer.sample().to(batch.device)
+                with autocast(clip["pixels"].device, self.precision):
+                    outputs.append(loss(clip))
+        loss.train()
+        terms = {key: torch.stack([out[key].float().mean() for out in outputs]).mean().item() for key in outputs[0].keys()}
+        self.table.write_validation(step, terms)
+        return {f"validation_{key}": value for key, value in terms.items()}
+
+    def register(self, trainer: Trainer, name: str = "validation") -> None:
+        """Registers after each step."""
+        self._trainer = trainer
+        trainer.register_op("post_steps_log", self)
+
+
+class Progress(TrainerHookBase):
+    """A progress bar over optimisation steps that shows the weighted loss terms.
+
+    Args:
+        steps: of the whole run.
+        interval: steps between updates of the numbers.
+    """
+
+    def __init__(self, steps: int, interval: int) -> None:
+        self.steps, self.interval = steps, interval
+        self.bar: tqdm | None = None
+
+    def __call__(self, optim_steps: int, losses: TensorDictBase) -> None:
+        """Called after every optimisation step."""
+        if self.bar is None:
+            self.bar = tqdm(total=self.steps, initial=optim_steps - 1, desc="train", unit="step", dynamic_ncols=True)
+        self.bar.update(1)
+        if optim_steps % self.interval == 0:
+            self.bar.set_postfix_str(_terms(losses.items()), refresh=False)
+        if optim_steps >= self.steps:
+            self.bar.close()
+
+    def register(self, trainer: Trainer, name: str = "progress") -> None:
+        """Registers after each optimisation step."""
+        trainer.register_op("post_optim_complete_log", self)
+
+
+def _terms(items: Iterable[tuple[str, torch.Tensor]]) -> str:
+    return " ".join(f"{key[5:]} {value.item():.3f}" for key, value in sorted(items) if key.startswith("loss_"))

@@ -1,0 +1,156 @@
+"""Trains a world model from stored clips, with TorchRL's trainer."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.objectives.common import LossModule
+from torchrl.record.loggers import Logger
+from torchrl.trainers import Trainer
+from torchrl.trainers.trainers import LRSchedulerHook
+
+from torchrl_ficreg.data import OfflineTrajectories
+from torchrl_ficreg.modules.precision import Precision
+from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS
+from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
+from torchrl_ficreg.trainers.stepper import OfflineStepper
+from torchrl_ficreg.trainers.stream import ReplayStream
+
+METRICS = "metrics.csv"
+
+
+class OfflineTrainer(Trainer):
+    """A :class:`torchrl.trainers.Trainer` that is fed by a replay buffer of clips.
+
+    One AdamW for everything, gradient clipping, linear warm-up and a cosine to zero over the real number of steps,
+    bfloat16 autocast where the device is good at it. TorchRL's hooks register on it as on any trainer; a *frame* in
+    their settings (``wait_for``, ``patience``) is one stored frame of a clip, batch x T of them a step.
+
+    With a ``run_dir`` it writes ``metrics.csv`` and, after every epoch, a checkpoint below ``checkpoints/``. Each is
+    published by one atomic rename and the previous one is kept until then: a kill at any instant leaves a loadable
+    one. :meth:`resume` continues from the latest, and on one device a resumed run ends with the very weights of an
+    unbroken one: optimiser, schedule, random state and the position in the data are part of a checkpoint.
+
+    Args:
+        loss_module: a loss such as :class:`~torchrl_ficreg.FICRegLoss`, already on its device.
+        replay_buffer: training clips.
+        epochs: passes over all clips.
+        lr, weight_decay: of AdamW.
+        warmup: share of all steps in which the learning rate rises from zero.
+        clip_norm: largest gradient norm.
+        precision: see :func:`~torchrl_ficreg.modules.precision.autocast`.
+        run_dir: folder for metrics and checkpoints; None writes nothing.
+        components: more things to put into a checkpoint, by name: anything with a ``state_dict``, or JSON values.
+        validation_buffer: clips of held-out episodes, evaluated after every epoch.
+        validation_batches: batches of them to average over.
+        log_interval: steps between rows of ``metrics.csv``.
+        logger: a TorchRL logger that receives the same numbers.
+        progress_bar: show one.
+
+    Raises:
+        FloatingPointError: a loss stopped being finite, see :class:`OfflineStepper`.
+        ValueError: a setting outside its range.
+    """
+
+    def __init__(
+        self,
+        loss_module: LossModule,
+        replay_buffer: OfflineTrajectories,
+        *,
+        epochs: int,
+        lr: float = 5e-5,
+        weight_decay: float = 1e-3,
+        warmup: float = 0.01,
+        clip_norm: float = 1.0,
+        precision: Precision = "auto",
+        run_dir: Path | str | None = None,
+        components: dict[str, Any] | None = None,
+        validation_buffer: OfflineTrajectories | None = None,
+        validation_batches: int = 4,
+        log_interval: int = 10,
+        logger: Logger | None = None,
+        progress_bar: bool = True,
+    ) -> None:
+        if epochs < 1 or lr <= 0 or weight_decay < 0 or clip_norm <= 0 or not 0 <= warmup < 1 or log_interval < 1:
+            raise ValueError(
+                "epochs, lr, clip_norm and log_interval must be positive, weight_decay not negative and warmup in "
+                f"[0, 1), got {epochs}, {lr}, {clip_norm}, {log_interval}, {weight_decay} and {warmup}."
+            )
+        self.steps_per_epoch = replay_buffer.batches_per_epoch
+        self.total_steps = epochs * self.steps_per_epoch
+        frames = replay_buffer.batch_size * replay_buffer.num_frames  # of one step
+        params = [p for p in loss_module.parameters() if p.requires_grad]
+        optimizer = torch.optim.AdamW(params, lr=lr, weight_decay=weight_decay, fused=params[0].device.type != "mps")
+        rotation = None if run_dir is None else CheckpointRotation(Path(run_dir) / CHECKPOINTS, keep_last=2)
+        super().__init__(
+            collector=ReplayStream(replay_buffer, params[0].device),
+            total_frames=self.total_steps * frames,
+            frame_skip=1,
+            optim_steps_per_batch=1,
+            loss_module=loss_module.train(),
+            optimizer=optimizer,
+            optimization_stepper=OfflineStepper(precision, clip_norm),
+            logger=logger,
+            progress_bar=False,
+            auto_log_optim_steps=False,
+            log_interval=0,
+            save_trainer_interval=self.steps_per_epoch * frames - 1,  # the comparison is strict
+            checkpoint=None if run_dir is None else Checkpoint(format="archive", rng=GlobalRNGState(), **(components or {})),
+            checkpoint_rotation=rotation,
+        )
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, WarmupCosine(self.total_steps, warmup))
+        LRSchedulerHook(schedule, interval="optim").register(self)
+        metrics = None if run_dir is None else Path(run_dir) / METRICS
+        self.metrics_table = MetricsTable(metrics, log_interval, self.total_steps)
+        self.metrics_table.register(self)
+        if validation_buffer is not None:
+            hook = Validation(validation_buffer, self.steps_per_epoch, validation_batches, precision, self.metrics_table)
+            hook.register(self)
+        if progress_bar:
+            Progress(self.total_steps, log_interval).register(self)
+
+    @property
+    def step(self) -> int:
+        """Optimisation steps taken."""
+        return self._optim_count
+
+    def resume(self) -> bool:
+        """Loads the latest checkpoint of the run, if there is one, and says whether there was."""
+        if self.checkpoint_rotation is None or self.checkpoint_rotation.latest() is None:
+            self.metrics_table.drop_after(0)
+            return False
+        self.checkpoint_rotation.load_latest(self._sync_checkpoint_components())
+        self.metrics_table.drop_after(self.step)
+        return True
+
+    def train(self) -> None:
+        """Runs to the end, or not at all when the resumed run had reached it."""
+        if self.step < self.total_steps:
+            super().train()
+
+
+class WarmupCosine:
+    """Factor of the learning rate: linear from 0 over the warm-up, then a cosine to 0 at the last step.
+
+    Args:
+        steps: of the whole run.
+        warmup: share of them in which the factor rises.
+
+    Examples:
+        >>> factor = WarmupCosine(steps=100, warmup=0.1)
+        >>> factor(0), factor(9), round(factor(100), 6)
+        (0.1, 1.0, 0.0)
+    """
+
+    def __init__(self, steps: int, warmup: float) -> None:
+        self.steps, self.rise = steps, max(1, round(warmup * steps))
+
+    def __call__(self, step: int) -> float:
+        """Factor of the update after ``step`` updates."""
+        if step < self.rise:
+            return (step + 1) / self.rise
+        return 0.5 * (1 + math.cos(math.pi * (step - self.rise) / max(1, self.steps - self.rise)))

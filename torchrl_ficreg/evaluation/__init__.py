@@ -1,0 +1,21 @@
+"""Judging a world model: by planning on frozen start-goal pairs, and by the shape of its latent space."""
+
+from torchrl_ficreg.evaluation.distance import DistanceProfile, latent_distance
+from torchrl_ficreg.evaluation.mpc import evaluate_mpc, Evaluation, UniformPolicy
+from torchrl_ficreg.evaluation.pairs import StartGoalPairs
+from torchrl_ficreg.evaluation.report import plot_latent_distance, plot_learning_curve, save_episodes_gif
+from torchrl_ficreg.evaluation.statistics import rank_correlation, wilson_interval
+
+__all__ = [
+    "DistanceProfile",
+    "Evaluation",
+    "StartGoalPairs",
+    "UniformPolicy",
+    "evaluate_mpc",
+    "latent_distance",
+    "plot_latent_distance",
+    "plot_learning_curve",
+    "rank_correlation",
+    "save_episodes_gif",
+    "wilson_interval",
+]

@@ -26,7 +26,7 @@ class ConvNetwork(nn.Module):
         self,
         *,
         image_size: int = 64,
-        channels: tuple[int, ...] = (32, 64, 128, 256),
+        channels: tuple[int, ...] = (16, 32, 64, 128),
         projector_dim: int = 128,
         latent_dim: int = 16,
     ) -> None:
@@ -37,18 +37,19 @@ class ConvNetwork(nn.Module):
         layers: list[nn.Module] = []
         for into, out in zip((3, *channels), channels):
             layers += [nn.Conv2d(into, out, kernel_size=4, stride=2, padding=1), nn.GELU()]
-        self.convolutions = nn.Sequential(*layers)
+        # Channels last is the layout that CPU kernels for bfloat16 want.
+        self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)
         left = image_size // 2 ** len(channels)
         self.projector = Projector(channels[-1] * left**2, projector_dim, latent_dim)
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         """[..., 3, H, W] -> [..., D]."""
-        frames = self.normalize(pixels)  # [N, 3, H, W]
+        frames = self.normalize(pixels).contiguous(memory_format=torch.channels_last)  # [N, 3, H, W]
         return restore_lead(self.projector(self.convolutions(frames).flatten(1)), pixels)
 
 
 class ConvEncoder(TensorDictModule):
-    """Encoder for small frames: ``pixels`` [..., 3, H, W] -> ``latent`` [..., D]. 1.2 M parameters, made for CPUs.
+    """Encoder for small frames: ``pixels`` [..., 3, H, W] -> ``latent`` [..., D]. 0.4 M parameters, made for CPUs.
 
     Args:
         in_key, out_key: where frames are read and latents are written.

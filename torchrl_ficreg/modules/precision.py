@@ -19,18 +19,17 @@ def has_fast_bf16(device: torch.device | str) -> bool:
     return False
 
 
-def autocast(device: torch.device | str, precision: Precision = "auto") -> torch.autocast:
-    """A bfloat16 autocast region on the device, or none.
-
-    Args:
-        device: where the tensors are.
-        precision: ``"bf16"``, ``"fp32"``, or ``"auto"``: bfloat16 where :func:`has_fast_bf16` says so.
+def uses_bf16(device: torch.device | str, precision: Precision = "auto") -> bool:
+    """Whether to compute in bfloat16: ``"bf16"`` always, ``"fp32"`` never, ``"auto"`` where it is fast.
 
     Raises:
         ValueError: an unknown precision.
     """
     if precision not in ("auto", "fp32", "bf16"):
         raise ValueError(f"unknown precision {precision!r}: choose 'auto', 'fp32' or 'bf16'.")
-    device = torch.device(device)
-    enabled = precision == "bf16" or (precision == "auto" and has_fast_bf16(device))
-    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled)
+    return precision == "bf16" or (precision == "auto" and has_fast_bf16(device))
+
+
+def autocast(device: torch.device | str, precision: Precision = "auto") -> torch.autocast:
+    """A bfloat16 autocast region on the device where :func:`uses_bf16` says so, else a region that changes nothing."""
+    return torch.autocast(torch.device(device).type, dtype=torch.bfloat16, enabled=uses_bf16(device, precision))

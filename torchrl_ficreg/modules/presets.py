@@ -25,6 +25,7 @@ class ModelConfig:
     frame_skip: int = 5  # F, environment steps between two frames of a clip
     latent_dim: int = 192  # D
     history: int = 3  # H, latents the predictor sees
+    conv_channels: tuple[int, ...] = (16, 32, 64, 128)  # of the "conv" encoder; each layer halves the frame
     encoder_projector_dim: int = 2048  # hidden width of the encoder's BatchNorm projector
     predictor_width: int = 192
     predictor_depth: int = 6
@@ -36,9 +37,11 @@ class ModelConfig:
     inverse_hidden_dim: int = 512  # hidden width of the inverse dynamics model
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "conv_channels", tuple(self.conv_channels))  # JSON and YAML know lists only
         if self.encoder not in ("vit", "conv"):
             raise ValueError(f"unknown encoder {self.encoder!r}: choose 'vit' or 'conv'.")
-        small = [name for name, value in asdict(self).items() if isinstance(value, int) and value < 1]
+        sizes = {name: value for name, value in asdict(self).items() if name not in ("encoder", "predictor_dropout")}
+        small = [name for name, value in sizes.items() if min(value if isinstance(value, tuple) else (value,)) < 1]
         if small:
             raise ValueError(f"model sizes must be positive, got {', '.join(f'{n}={getattr(self, n)}' for n in small)}.")
         if not 0 <= self.predictor_dropout < 1:
@@ -88,10 +91,15 @@ def make_world_model(config: ModelConfig, action_dim: int) -> tuple[LatentWorldM
         18034478
     """
     block = config.frame_skip * action_dim
-    make_encoder = ViTEncoder if config.encoder == "vit" else ConvEncoder
-    encoder = make_encoder(
-        image_size=config.image_size, latent_dim=config.latent_dim, projector_dim=config.encoder_projector_dim
-    )
+    sizes = {
+        "image_size": config.image_size,
+        "latent_dim": config.latent_dim,
+        "projector_dim": config.encoder_projector_dim,
+    }
+    if config.encoder == "vit":
+        encoder = ViTEncoder(**sizes)
+    else:
+        encoder = ConvEncoder(channels=config.conv_channels, **sizes)
     predictor = CausalPredictor(
         latent_dim=config.latent_dim,
         action_dim=block,

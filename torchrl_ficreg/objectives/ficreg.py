@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import dispatch, TensorDictModule
 from torch import nn
-from torchrl.objectives.utils import _cache_values
 
 from torchrl_ficreg.objectives.lewm import _call, _Clip, LeWMLoss
 from torchrl_ficreg.objectives.sigreg import SIGReg
@@ -95,11 +94,6 @@ class FICRegLoss(LeWMLoss):
         self.register_coeff_buffer("idm_coeff", idm_coeff)
         self.register_coeff_buffer("consistency_coeff", consistency_coeff)
 
-    @property
-    @_cache_values
-    def _frozen_inverse_params(self) -> TensorDictBase:
-        return self.inverse_model_params.detach()
-
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
@@ -110,15 +104,14 @@ class FICRegLoss(LeWMLoss):
         if self.context == "detached":
             predicted = self._predict(real[..., :-1, :], clip.action, _with_own_buffers(self.predictor_params))
         recovered = self._recover(real[..., :-1, :], real[..., 1:, :], self.inverse_model_params)
-        judged = self._recover(real[..., :-1, :], predicted, self._frozen_inverse_params)
+        judged = self._recover(real[..., :-1, :], predicted, self.inverse_model_params.detach())
         terms["loss_idm"] = self.idm_coeff * self._reduce(squared_error(recovered, clip.action), clip)
         terms["loss_consistency"] = self.consistency_coeff * self._reduce(squared_error(judged, clip.action), clip)
         return TensorDict(terms)
 
     def _recover(self, latent: torch.Tensor, next_latent: torch.Tensor, params: TensorDictBase) -> torch.Tensor:
         """Action blocks [B, T - 1, F * A] that lead from latent to next_latent [B, T - 1, D]."""
-        with params.to_module(self.inverse_model, preserve_module_state=False):
-            return _call(self.inverse_model, latent, next_latent)
+        return _call(self.inverse_model, params, latent, next_latent)
 
 
 def _with_own_buffers(params: TensorDictParams) -> TensorDictBase:

@@ -41,7 +41,8 @@ def gradient_flow(loss: LossModule, clip: TensorDictBase) -> dict[str, dict[str,
     for term, value in terms.items():
         table[term] = {}
         for name, params in networks.items():
-            grads = torch.autograd.grad(value, params, retain_graph=True, allow_unused=True)
+            reachable = bool(params) and value.requires_grad  # not so where networks are frozen
+            grads = torch.autograd.grad(value, params, retain_graph=True, allow_unused=True) if reachable else ()
             squares = [grad.float().square().sum() for grad in grads if grad is not None]
             table[term][name] = torch.stack(squares).sum().sqrt().item() if squares else 0.0
     return table

@@ -123,14 +123,12 @@ class LeWMLoss(LossModule):
 
     def _encode_and_predict(self, clip: _Clip) -> tuple[torch.Tensor, torch.Tensor]:
         """Latents [B, T, D] and predictions of all but the first [B, T - 1, D]."""
-        with self.encoder_params.to_module(self.encoder, preserve_module_state=False):
-            latent = _call(self.encoder, clip.pixels)
+        latent = _call(self.encoder, self.encoder_params, clip.pixels)
         return latent, self._predict(latent[..., :-1, :], clip.action, self.predictor_params)
 
     def _predict(self, latent: torch.Tensor, action: torch.Tensor, params: TensorDictBase) -> torch.Tensor:
         """Next latents [B, T - 1, D] from latents and action blocks [B, T - 1, ...]."""
-        with params.to_module(self.predictor, preserve_module_state=False):
-            return _call(self.predictor, latent, action)
+        return _call(self.predictor, params, latent, action)
 
     def _baseline_terms(self, clip: _Clip, latent: torch.Tensor, predicted: torch.Tensor) -> dict[str, torch.Tensor]:
         """``loss_pred`` (encoder and predictor receive gradient) and ``loss_sigreg`` (encoder only)."""
@@ -178,6 +176,11 @@ class _Clip:
         mask = tensordict.get(keys.mask, None)
         action = action[..., :-1, :]
         if mask is not None:
+            if mask.shape != pixels.shape[:-3] or mask.dtype != torch.bool:
+                raise ValueError(
+                    f"a mask says of every frame's action block whether to trust it: expected {list(pixels.shape[:-3])} "
+                    f"bool, got {list(mask.shape)} {mask.dtype}."
+                )
             mask = mask[..., :-1]
             action = torch.where(mask.unsqueeze(-1), action, 0.0)
         return cls(pixels, action, mask)
@@ -191,7 +194,12 @@ def _require(tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
     return value
 
 
-def _call(module: TensorDictModule, *inputs: torch.Tensor) -> torch.Tensor:
-    """Feeds a TensorDictModule by its own keys and returns what it writes first."""
+def _call(module: TensorDictModule, params: TensorDictBase, *inputs: torch.Tensor) -> torch.Tensor:
+    """Feeds a TensorDictModule, with these parameters, by its own keys and returns what it writes first."""
     tensordict = TensorDict(dict(zip(module.in_keys, inputs)), batch_size=inputs[0].shape[:1])
-    return module(tensordict).get(module.out_keys[0])
+    with params.to_module(module, preserve_module_state=False) as swap:
+        try:
+            return module(tensordict).get(module.out_keys[0])
+        except Exception:
+            swap.__exit__(None, None, None)  # tensordict itself leaves the module with these parameters
+            raise

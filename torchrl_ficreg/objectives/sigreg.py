@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import nn
+from torch.autograd.function import once_differentiable
 
 
 class SIGReg(nn.Module):
@@ -82,6 +83,7 @@ class _EppsPulley(torch.autograd.Function):
         return angle.shape[-2] * ((deviation.square() + skew.square()) @ weight)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, grad: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         cos, sin, deviation, skew, weight = ctx.saved_tensors
         order = torch.arange(1, len(weight) + 1, device=weight.device, dtype=weight.dtype)

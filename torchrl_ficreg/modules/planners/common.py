@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,7 +17,7 @@ from torchrl.modules.planners import MPCPlannerBase
 
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.planners.costs import GoalDistance
-from torchrl_ficreg.modules.precision import autocast, Precision
+from torchrl_ficreg.modules.precision import Precision, uses_bf16
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 PLAN, PLAN_COST, PLAN_SEED = "plan", "plan_cost", "plan_seed"
@@ -108,6 +109,13 @@ class LatentPlanner(MPCPlannerBase):
                 f"action_bounds must be low < high of shape {list(shape)}, got {low.tolist()} and {high.tolist()}: "
                 "was the model trained for another environment?"
             )
+        mean, std = self.world_model.action_mean.cpu(), self.world_model.action_std.cpu()
+        # No distribution inside the bounds has a mean outside them or a std above half their distance.
+        if ((mean < low) | (mean > high) | (std > (high - low) / 2 * 1.001)).any() and (std != 1).any():
+            raise ValueError(
+                f"the model's action statistics (mean {mean.tolist()}, std {std.tolist()}) cannot come from actions "
+                f"between {low.tolist()} and {high.tolist()}: was the model trained for another environment?"
+            )
         return low, high
 
     def block_bounds(self) -> tuple[torch.Tensor, torch.Tensor] | None:
@@ -149,12 +157,26 @@ class LatentPlanner(MPCPlannerBase):
                 f"and {len(seeds)}."
             )
         group = 1 if latent.device.type == "cpu" else max(1, len(latent))
-        with autocast(latent.device, self.config.precision):
+        with self._dynamics_in_precision(latent.device):
             results = [
                 self._search(latent[i : i + group], goal[i : i + group], seeds[i : i + group])
                 for i in range(0, len(latent), group)
             ]
         return torch.cat(results)
+
+    @contextmanager
+    def _dynamics_in_precision(self, device: torch.device) -> Iterator[None]:
+        """Swaps the predictor's weights for bfloat16 copies: autocast would cast them anew at every imagined step."""
+        network = self.world_model.predictor.module
+        if not uses_bf16(device, self.config.precision):
+            yield
+            return
+        weights = TensorDict.from_module(network).detach().apply(_to_bf16)
+        swap = weights.to_module(network, preserve_module_state=False).__enter__()
+        try:
+            yield
+        finally:
+            swap.__exit__(None, None, None)  # tensordict does not restore a module if told about an exception
 
     @abc.abstractmethod
     def _search(self, latent: torch.Tensor, goal: torch.Tensor, seeds: list[int]) -> TensorDict:
@@ -172,4 +194,10 @@ class LatentPlanner(MPCPlannerBase):
     def _imagined_cost(self, latent: torch.Tensor, goal: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Cost [e, K] of candidates [e, K, horizon, F * A] from latents [e, C, D]."""
         start = latent.unsqueeze(1).expand(-1, action.shape[1], -1, -1)  # [e, K, C, D]
-        return self.cost(self.world_model.rollout(start, action).float(), goal)
+        dtype = self.world_model.predictor.module.position.dtype
+        predicted = self.world_model.rollout(start.to(dtype), action.to(dtype))  # [e, K, horizon, D]
+        return self.cost(predicted.float(), goal)
+
+
+def _to_bf16(value: torch.Tensor) -> torch.Tensor:
+    return value.bfloat16() if value.is_floating_point() else value

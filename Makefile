@@ -1,0 +1,31 @@
+# Two commands: `make train` shows it work, `make test` checks it. Both set .venv up first, if needed.
+PYTHON ?= python3
+VENV := .venv
+RUN := $(VENV)/bin/python
+READY := $(VENV)/.ready
+PYTEST := $(RUN) -m pytest
+
+.PHONY: train test slow lint docs clean
+
+train: $(READY)
+	$(RUN) sota-implementations/ficreg/train.py $(ARGS)
+
+test: $(READY)
+	$(PYTEST) $(ARGS)
+
+slow: $(READY)
+	$(PYTEST) -m slow $(ARGS)
+
+lint: $(READY)
+	$(VENV)/bin/pip install -q flake8 pydocstyle
+	$(RUN) -m flake8 torchrl_ficreg sota-implementations test
+	$(RUN) -m pydocstyle torchrl_ficreg sota-implementations
+
+# Everything in one call, so that pip sees all requirements at once; the marker is written only when it succeeded.
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install -q -c constraints.txt -e '.[plot,test]'
+	touch $(READY)
+
+clean:
+	rm -rf $(VENV)

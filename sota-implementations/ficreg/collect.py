@@ -1,0 +1,21 @@
+"""Records expert episodes: python collect.py env=two_room. Run again after an interruption, it continues."""
+
+from __future__ import annotations
+
+from cli import entry_point
+from omegaconf import DictConfig
+from utils import collect_dataset
+
+from torchrl_ficreg.data import OfflineTrajectories
+
+
+@entry_point("collect")
+def main(cfg: DictConfig) -> None:
+    """Records what is missing and says what is there."""
+    path = collect_dataset(cfg)
+    dataset = OfflineTrajectories(path, split="all", num_frames=2, frame_skip=1)
+    print(f"{path}: {len(dataset.episodes)} episodes, {dataset.num_steps} steps")
+
+
+if __name__ == "__main__":
+    main()

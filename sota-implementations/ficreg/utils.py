@@ -1,0 +1,233 @@
+"""The parts that the scripts put together."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import tensordict
+import torch
+import torchrl
+from omegaconf import DictConfig, OmegaConf
+from torchrl.record.loggers import get_logger, Logger
+from tqdm import tqdm
+
+from torchrl_ficreg import FICRegLoss, LatentCEMPlanner, LatentWorldModel, LeWMLoss, ModelConfig, MPCPolicy, PlanConfig
+from torchrl_ficreg.data import EpisodeWriter, OfflineTrajectories
+from torchrl_ficreg.envs import collect_episodes, make_env
+from torchrl_ficreg.modules.inverse import InverseDynamicsModel
+from torchrl_ficreg.trainers import ModelCard
+
+
+def get_device(name: str) -> torch.device:
+    """The device a configuration names.
+
+    Raises:
+        ValueError: there is no such device on this machine.
+    """
+    try:
+        device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"device={name} cannot be used here ({error}): choose device=auto or device=cpu.") from error
+    return device
+
+
+def dataset_path(cfg: DictConfig) -> Path:
+    """Where the dataset of a configuration lives."""
+    return Path(cfg.data_dir) / f"{cfg.env.name}_{cfg.model.image_size}px_seed{cfg.env.data.seed}"
+
+
+def collect_dataset(cfg: DictConfig) -> Path:
+    """Records what the dataset still lacks, which may be nothing, and returns its folder."""
+    path, data = dataset_path(cfg), cfg.env.data
+    low, high = action_bounds(cfg.env.name)
+    meta = {
+        "env": cfg.env.name,
+        "env_kwargs": OmegaConf.to_container(cfg.env.kwargs),
+        "expert": OmegaConf.to_container(data.expert),
+        "image_size": cfg.model.image_size,
+        "max_steps": data.max_steps,
+        "seed": data.seed,
+        "action_low": low,
+        "action_high": high,
+    }
+    with EpisodeWriter(path, target_episodes=data.episodes, meta=meta) as writer:
+        if writer.complete:
+            return path
+        episodes = collect_episodes(
+            cfg.env.name,
+            data.episodes,
+            seed=data.seed,
+            start=writer.num_episodes,
+            num_workers=cfg.collect.num_workers,
+            image_size=cfg.model.image_size,
+            max_steps=data.max_steps,
+            expert_kwargs=OmegaConf.to_container(data.expert),
+            env_kwargs=OmegaConf.to_container(cfg.env.kwargs),
+        )
+        bar = tqdm(total=data.episodes, initial=writer.num_episodes, desc="collect", unit="episode", dynamic_ncols=True)
+        first_step = writer.num_steps
+        for episode in episodes:
+            writer.append(episode)
+            bar.update()
+            elapsed = bar.format_dict["elapsed"]
+            bar.set_postfix_str(f"{(writer.num_steps - first_step) / max(elapsed, 1e-9):.0f} frames/s", refresh=False)
+        bar.close()
+    return path
+
+
+def make_dataset(cfg: DictConfig, path: Path, split: str, **changes: Any) -> OfflineTrajectories:
+    """One split of a dataset as clips for the model of a configuration."""
+    settings = {
+        "split": split,
+        "num_frames": cfg.model.history + 1,
+        "frame_skip": cfg.model.frame_skip,
+        "batch_size": cfg.optim.batch_size,
+        "seed": cfg.seed,
+    }
+    return OfflineTrajectories(path, **{**settings, **changes})
+
+
+def model_config(cfg: DictConfig) -> ModelConfig:
+    """The sizes in a configuration's ``model`` group."""
+    names = {field.name for field in fields(ModelConfig)}
+    values = OmegaConf.to_container(cfg.model)
+    return ModelConfig(**{name: value for name, value in values.items() if name in names})
+
+
+def make_loss(cfg: DictConfig, model: LatentWorldModel, inverse_model: InverseDynamicsModel) -> LeWMLoss:
+    """The loss of a configuration's ``method``."""
+    if cfg.method.name == "lewm":
+        return LeWMLoss(model.encoder, model.predictor, sigreg_coeff=cfg.loss.sigreg_coeff)
+    return FICRegLoss(model.encoder, model.predictor, inverse_model, context=cfg.method.context, **cfg.loss)
+
+
+def make_logger(cfg: DictConfig, run_dir: Path) -> Logger | None:
+    """A TorchRL logger besides ``metrics.csv``, where one is asked for.
+
+    Raises:
+        ImportError: its package is missing.
+    """
+    backend = cfg.logger.backend
+    if backend == "csv":
+        return None
+    try:
+        extra = {"wandb_kwargs": {"mode": cfg.logger.mode, "project": cfg.logger.project}} if backend == "wandb" else {}
+        logger = get_logger(backend, logger_name=str(run_dir / backend), experiment_name=cfg.name, **extra)
+    except ImportError as error:
+        package = "'torchrl_ficreg[wandb]'" if backend == "wandb" else "tensorboard"
+        raise ImportError(f"logger.backend={backend} needs a package: pip install {package}.") from error
+    logger.log_hparams(OmegaConf.to_container(cfg, resolve=True))
+    return logger
+
+
+def make_card(cfg: DictConfig, dataset: OfflineTrajectories) -> ModelCard:
+    """What a checkpoint tells about itself."""
+    meta = dataset.meta
+    return ModelCard(
+        model=asdict(model_config(cfg)),
+        env=meta["env"],
+        env_kwargs=meta["env_kwargs"],
+        action_low=meta["action_low"],
+        action_high=meta["action_high"],
+        config=OmegaConf.to_container(cfg, resolve=True),
+    )
+
+
+def plan_config(plan: DictConfig) -> PlanConfig:
+    """The settings in a configuration's ``plan`` group."""
+    values = OmegaConf.to_container(plan)
+    search = values.pop("search")
+    if search != "cem":
+        raise ValueError(f"unknown plan.search {search!r}: choose cem.")
+    return PlanConfig(**values)
+
+
+def make_policy(plan: DictConfig, model: LatentWorldModel, low: list[float], high: list[float]) -> MPCPolicy:
+    """The planner of a configuration's ``plan`` group, serving one action per environment step."""
+    return MPCPolicy(LatentCEMPlanner(model, plan_config(plan), action_bounds=(low, high)))
+
+
+def action_bounds(env: str) -> tuple[list[float], list[float]]:
+    """Bounds of a raw action [A], environment units."""
+    space = make_env(env).full_action_spec_unbatched["action"].space
+    return space.low.tolist(), space.high.tolist()
+
+
+def check_settings(cfg: DictConfig) -> None:
+    """Finds mistakes in a configuration before anything is written.
+
+    Raises:
+        ValueError: a setting outside its range, or an unknown choice.
+    """
+    model_config(cfg)
+    plan_config(cfg.plan)
+    get_device(cfg.device)
+    if cfg.logger.backend not in ("csv", "wandb", "tensorboard"):
+        raise ValueError(f"unknown logger.backend {cfg.logger.backend!r}: choose csv, wandb or tensorboard.")
+    if cfg.method.name == "ficreg" and cfg.method.context not in ("detached", "live"):
+        raise ValueError(f"unknown method.context {cfg.method.context!r}: choose detached or live.")
+    optim, evaluation = cfg.optim, cfg.evaluation
+    positive = {"optim.epochs": optim.epochs, "optim.batch_size": optim.batch_size, "optim.lr": optim.lr}
+    positive |= {"optim.clip_norm": optim.clip_norm, "env.data.episodes": cfg.env.data.episodes}
+    positive |= {"env.budget": cfg.env.budget, "env.goal_offset": cfg.env.goal_offset}
+    positive |= {"evaluation.num_pairs": evaluation.num_pairs, "evaluation.num_envs": evaluation.num_envs}
+    positive |= {"evaluation.record": evaluation.record, "logger.interval": cfg.logger.interval}
+    wrong = [f"{key}={value}" for key, value in positive.items() if not value > 0]
+    if wrong:
+        raise ValueError(f"must be positive: {', '.join(wrong)}.")
+
+
+def claim_run_dir(cfg: DictConfig) -> Path:
+    """The run's folder, which belongs to one configuration for good.
+
+    Raises:
+        ValueError: it holds a run of another configuration.
+    """
+    run_dir, ours = Path(cfg.runs_dir) / cfg.name, OmegaConf.to_container(cfg, resolve=True)
+    path = run_dir / "config.yaml"
+    if path.exists():
+        theirs = OmegaConf.to_container(OmegaConf.load(path))
+        differ = sorted(key for key in _flat(ours) | _flat(theirs) if _flat(ours).get(key) != _flat(theirs).get(key))
+        differ = [key for key in differ if not key.startswith(("collect.", "device", "evaluation.", "plan."))]
+        if differ:
+            what = ", ".join(f"{key}: {_flat(theirs).get(key)} -> {_flat(ours).get(key)}" for key in differ[:3])
+            raise ValueError(f"{run_dir} holds a run of another configuration ({what}): give another name=...")
+    run_dir.mkdir(parents=True, exist_ok=True)
+    write_text(path, OmegaConf.to_yaml(OmegaConf.create(ours)))
+    return run_dir
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file in one piece."""
+    part = path.with_name(path.name + ".part")
+    part.write_text(text)
+    os.replace(part, path)
+
+
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Writes a JSON file in one piece."""
+    write_text(path, json.dumps(values, indent=2) + "\n")
+
+
+def versions() -> dict[str, str]:
+    """What a result depends on besides its configuration."""
+    return {
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "torchrl": torchrl.__version__,
+        "tensordict": tensordict.__version__,
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads",
+    }

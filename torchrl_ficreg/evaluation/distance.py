@@ -1,0 +1,82 @@
+"""Does latent distance grow with true distance? A planner has a slope to follow only where it does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchrl_ficreg.data import OfflineTrajectories
+from torchrl_ficreg.data.schema import PIXELS, STATE
+from torchrl_ficreg.evaluation.statistics import rank_correlation
+from torchrl_ficreg.modules.world_model import LatentWorldModel
+
+
+@dataclass
+class DistanceProfile:
+    """Pairs of frames: how far apart in truth, how far in latent space.
+
+    Attributes:
+        true: [P], Euclidean distance between simulator states, their unit.
+        latent: [P], Euclidean distance between latents.
+    """
+
+    true: np.ndarray
+    latent: np.ndarray
+
+    @property
+    def rank_correlation(self) -> float:
+        """Spearman's, over all pairs."""
+        return rank_correlation(self.true, self.latent)
+
+    def bins(self, count: int = 12) -> tuple[np.ndarray, np.ndarray]:
+        """Quantiles of the latent distance within bins of true distance.
+
+        Returns:
+            mean true distance [count] and the 10th, 50th and 90th percentile of the latent one [count, 3].
+        """
+        edges = np.quantile(self.true, np.linspace(0, 1, count + 1))
+        which = np.clip(np.searchsorted(edges, self.true, side="right") - 1, 0, count - 1)
+        kept = [index for index in range(count) if (which == index).any()]
+        center = np.array([self.true[which == index].mean() for index in kept])
+        spread = np.array([np.quantile(self.latent[which == index], (0.1, 0.5, 0.9)) for index in kept])
+        return center, spread
+
+    def summary(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        center, spread = self.bins()
+        return {
+            "rank_correlation": self.rank_correlation,
+            "true_distance": center.round(3).tolist(),
+            "median_latent_distance": spread[:, 1].round(4).tolist(),
+        }
+
+
+@torch.no_grad()
+def latent_distance(
+    model: LatentWorldModel, dataset: OfflineTrajectories, *, num_frames: int = 400, seed: int = 0
+) -> DistanceProfile:
+    """Compares all pairs among some frames of held-out episodes.
+
+    Args:
+        model: in eval mode.
+        dataset: held-out episodes.
+        num_frames: frames drawn, at most all there are.
+        seed: of the draw.
+    """
+    table = dataset.episodes
+    ends = table["length"].cumsum(0)
+    total = int(ends[-1])
+    picks = np.sort(np.random.default_rng(seed).choice(total, min(num_frames, total), replace=False))
+    rows = torch.searchsorted(ends, torch.from_numpy(picks), right=True)
+    steps = torch.from_numpy(picks) - (ends - table["length"])[rows]
+    frames = [dataset.episode_data(int(table["episode"][r]))[int(s)] for r, s in zip(rows, steps)]
+    state = torch.stack([frame[STATE] for frame in frames])  # [N, S]
+    device = model.action_mean.device
+    chunks = torch.stack([frame[PIXELS] for frame in frames]).split(64)
+    latent = torch.cat([model.encode(chunk.to(device)).float().cpu() for chunk in chunks])  # [N, D]
+    first, second = torch.triu_indices(len(frames), len(frames), offset=1)
+    true = (state[first] - state[second]).norm(dim=-1).numpy()
+    return DistanceProfile(true, (latent[first] - latent[second]).norm(dim=-1).numpy())

@@ -5,7 +5,7 @@ RUN := $(VENV)/bin/python
 READY := $(VENV)/.ready
 PYTEST := $(RUN) -m pytest
 
-.PHONY: train test slow lint docs clean
+.PHONY: train test slow lint docs study clean
 
 train: $(READY)
 	$(RUN) sota-implementations/ficreg/train.py $(ARGS)
@@ -20,6 +20,14 @@ lint: $(READY)
 	$(VENV)/bin/pip install -q flake8 pydocstyle
 	$(RUN) -m flake8 torchrl_ficreg sota-implementations test
 	$(RUN) -m pydocstyle torchrl_ficreg sota-implementations
+
+docs: $(READY)
+	$(VENV)/bin/pip install -q sphinx
+	$(RUN) -m sphinx -q -W -b html docs/source docs/_build
+
+# The comparison behind the table in the README: three seeds of both methods, about 50 minutes on two cores.
+study: $(READY)
+	PYTHON=$(RUN) sota-check/run_two_room.sh
 
 # Everything in one call, so that pip sees all requirements at once; the marker is written only when it succeeded.
 $(READY): pyproject.toml constraints.txt

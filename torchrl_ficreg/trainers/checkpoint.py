@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 CHECKPOINTS = "checkpoints"
 _CARD, _MODEL, _INVERSE = "card", "world_model", "inverse_model"
+DAMAGES = (CheckpointError, zipfile.BadZipFile, EOFError)  # what reading a damaged or foreign checkpoint raises
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def load_world_model(path: Path | str) -> tuple[LatentWorldModel, InverseDynamic
         card = ModelCard(**values[_CARD])
         model, inverse_model = make_world_model(ModelConfig(**card.model), card.action_dim)
         parts = {_MODEL: model, _INVERSE: inverse_model}
-        Checkpoint(**parts).load(path, components=list(parts))
-    except (CheckpointError, TypeError, KeyError) as error:
+        Checkpoint(**parts).load(path, components=list(parts), map_location="cpu")
+    except (*DAMAGES, TypeError, KeyError) as error:
         raise ValueError(f"{path} is not a whole checkpoint of a world model ({error}).") from error
     return model.eval(), inverse_model.eval(), card

@@ -17,11 +17,15 @@ from tqdm import tqdm
 
 from torchrl_ficreg.modules.precision import autocast, Precision
 
+# Validation rows lack these, and where an epoch is shorter than the interval one of them comes first.
+_TRAIN_ONLY = ("grad_norm", "learning_rate", "steps_per_second")
+
 
 class MetricsTable(TrainerHookBase):
     """Writes one row of ``metrics.csv`` every few steps and hands the numbers to the trainer's logger.
 
-    Columns are fixed by the first row. A resumed run drops the rows that were written after its checkpoint.
+    Columns are fixed by the first row. A resumed run drops the rows that were written after its checkpoint. The first
+    step of a process is always handed to the logger, so that hooks such as TorchRL's ``EarlyStopping`` find a value.
 
     Args:
         path: the CSV file, or None for the logger alone.
@@ -32,17 +36,20 @@ class MetricsTable(TrainerHookBase):
     def __init__(self, path: Path | None, interval: int, last_step: int) -> None:
         self.path, self.interval, self.last_step = path, interval, last_step
         self._since = (time.perf_counter(), 0)
+        self._silent = True
 
     def __call__(self, optim_steps: int, losses: TensorDictBase) -> dict[str, float] | None:
         """Called after every optimisation step."""
-        if optim_steps % self.interval and optim_steps != self.last_step:
+        due = optim_steps % self.interval == 0 or optim_steps == self.last_step
+        if not due and not self._silent:
             return None
+        self._silent = False
         now, (then, before) = time.perf_counter(), self._since
         self._since = (now, optim_steps)
         row = {key: value.float().mean().item() for key, value in sorted(losses.items())}
-        row["learning_rate"] = self._trainer.optimizer.param_groups[0]["lr"]
         row["steps_per_second"] = (optim_steps - before) / max(now - then, 1e-9)
-        self._write({"step": optim_steps, "split": "train", **row})
+        if due:
+            self._write({"step": optim_steps, "split": "train", **row})
         return row
 
     def write_validation(self, step: int, terms: dict[str, float]) -> None:
@@ -53,8 +60,9 @@ class MetricsTable(TrainerHookBase):
         if self.path is None:
             return
         new = not self.path.exists()
+        self.path.parent.mkdir(parents=True, exist_ok=True)
         with open(self.path, "a", newline="") as file:
-            columns = list(row) if new else self._columns()
+            columns = list(dict.fromkeys([*row, *_TRAIN_ONLY])) if new else self._columns()
             writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
             if new:
                 writer.writeheader()
@@ -70,8 +78,11 @@ class MetricsTable(TrainerHookBase):
         if self.path is None or not self.path.exists():
             return
         with open(self.path, newline="") as file:
-            header, *rows = csv.reader(file)
+            header, *rows = [*csv.reader(file)] or [[]]  # a kill may leave an empty file
         kept = [row for row in rows if len(row) == len(header) and int(row[0]) <= step]
+        if not kept:
+            self.path.unlink()
+            return
         part = self.path.with_suffix(".part")
         with open(part, "w", newline="") as file:
             csv.writer(file).writerows([header, *kept])
@@ -79,7 +90,6 @@ class MetricsTable(TrainerHookBase):
 
     def register(self, trainer: Trainer, name: str = "metrics_table") -> None:
         """Registers after each optimisation step."""
-        self._trainer = trainer
         trainer.register_op("post_optim_complete_log", self)
 
 
@@ -115,7 +125,7 @@ class Validation(TrainerHookBase):
             outputs = []
             for _ in range(self.batches):
                 clip = self.replay_buffer.sample().to(batch.device)
-                with autocast(clip["pixels"].device, self.precision):
+                with autocast(batch.device, self.precision):
                     outputs.append(loss(clip))
         loss.train()
         terms = {key: torch.stack([out[key].float().mean() for out in outputs]).mean().item() for key in outputs[0].keys()}

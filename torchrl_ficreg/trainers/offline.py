@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from torchrl.trainers.trainers import LRSchedulerHook
 
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.modules.precision import Precision
-from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS
+from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, DAMAGES
 from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
 from torchrl_ficreg.trainers.stepper import OfflineStepper
 from torchrl_ficreg.trainers.stream import ReplayStream
@@ -37,7 +38,7 @@ class OfflineTrainer(Trainer):
 
     Args:
         loss_module: a loss such as :class:`~torchrl_ficreg.FICRegLoss`, already on its device.
-        replay_buffer: training clips.
+        replay_buffer: training clips, in whole batches (``drop_last``).
         epochs: passes over all clips.
         lr, weight_decay: of AdamW.
         warmup: share of all steps in which the learning rate rises from zero.
@@ -53,7 +54,7 @@ class OfflineTrainer(Trainer):
 
     Raises:
         FloatingPointError: a loss stopped being finite, see :class:`OfflineStepper`.
-        ValueError: a setting outside its range.
+        ValueError: a setting outside its range, or a buffer that serves incomplete batches.
     """
 
     def __init__(
@@ -80,7 +81,11 @@ class OfflineTrainer(Trainer):
                 "epochs, lr, clip_norm and log_interval must be positive, weight_decay not negative and warmup in "
                 f"[0, 1), got {epochs}, {lr}, {clip_norm}, {log_interval}, {weight_decay} and {warmup}."
             )
+        if validation_buffer is not None and validation_batches < 1:
+            raise ValueError(f"validation_batches must be positive, got {validation_batches}.")
         self.steps_per_epoch = replay_buffer.batches_per_epoch
+        if self.steps_per_epoch * replay_buffer.batch_size > len(replay_buffer):
+            raise ValueError("the last batch of an epoch is incomplete: make the training buffer with drop_last=True.")
         self.total_steps = epochs * self.steps_per_epoch
         frames = replay_buffer.batch_size * replay_buffer.num_frames  # of one step
         params = [p for p in loss_module.parameters() if p.requires_grad]
@@ -119,13 +124,31 @@ class OfflineTrainer(Trainer):
         return self._optim_count
 
     def resume(self) -> bool:
-        """Loads the latest checkpoint of the run, if there is one, and says whether there was."""
-        if self.checkpoint_rotation is None or self.checkpoint_rotation.latest() is None:
-            self.metrics_table.drop_after(0)
-            return False
-        self.checkpoint_rotation.load_latest(self._sync_checkpoint_components())
+        """Loads the latest checkpoint of the run, if there is one, and says whether there was.
+
+        Raises:
+            ValueError: the checkpoint is damaged, or belongs to other networks, data or hooks.
+        """
+        latest = None if self.checkpoint_rotation is None else self.checkpoint_rotation.latest()
+        if latest is not None:
+            try:
+                self.checkpoint_rotation.load_latest(self._sync_checkpoint_components())
+            except DAMAGES as error:
+                raise ValueError(
+                    f"{latest} cannot be continued ({error}): repeat the settings it was made with, or, if it is "
+                    "damaged, move it away to continue from the one before."
+                ) from error
+        self._sweep()
         self.metrics_table.drop_after(self.step)
-        return True
+        return latest is not None
+
+    def _sweep(self) -> None:
+        """Removes what a killed process left half-written beside its checkpoints."""
+        if self.checkpoint_rotation is None:
+            return
+        for pattern in (".*.stage-*", ".*.archive-*"):
+            for left in self.checkpoint_rotation.directory.glob(pattern):
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
 
     def train(self) -> None:
         """Runs to the end, or not at all when the resumed run had reached it."""

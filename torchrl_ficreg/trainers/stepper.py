@@ -19,7 +19,7 @@ class OfflineStepper(OptimizationStepper):
         clip_norm: largest gradient norm over all parameters.
 
     Raises:
-        FloatingPointError: a loss or a gradient is not finite. Nothing is updated; the message names the step, the
+        FloatingPointError: a loss or a gradient is not finite. No weight is updated; the message names the step, the
             term and the last good checkpoint.
     """
 
@@ -27,7 +27,7 @@ class OfflineStepper(OptimizationStepper):
         self.precision, self.clip_norm = precision, clip_norm
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
-        """Takes one step and returns the detached terms and ``grad_norm``."""
+        """Takes one step and returns the detached terms, ``grad_norm`` before clipping and ``learning_rate``."""
         params = [p for group in trainer.optimizer.param_groups for p in group["params"]]
         with autocast(params[0].device, self.precision):
             output = trainer.loss_module(sub_batch)
@@ -38,10 +38,11 @@ class OfflineStepper(OptimizationStepper):
         if not torch.isfinite(total.detach() + grad_norm):  # the one host synchronisation of a step
             trainer.optimizer.zero_grad()
             raise FloatingPointError(self._describe(trainer, terms))
+        rate = torch.tensor(trainer.optimizer.param_groups[0]["lr"])  # of this update; the schedule moves on afterwards
         trainer.optimizer.step()
         trainer.optimizer.zero_grad()
         detached = {key: value.detach() for key, value in output.items()}
-        return TensorDict({**detached, "grad_norm": grad_norm.detach()})
+        return TensorDict({**detached, "grad_norm": grad_norm.detach(), "learning_rate": rate})
 
     @staticmethod
     def _describe(trainer: Trainer, terms: dict[str, torch.Tensor]) -> str:

@@ -11,10 +11,10 @@ from torchrl.data import ReplayBuffer
 
 
 class ReplayStream:
-    """An endless stream of batches in the place of a collector; its position is its whole state.
+    """An endless stream of batches in the place of a collector; the position in the data is its whole state.
 
     Args:
-        replay_buffer: clips; its sampler can :meth:`seek` to a number of batches drawn.
+        replay_buffer: clips; its ``state_dict`` is a position.
         device: where batches go. Frames travel as uint8.
     """
 
@@ -22,22 +22,22 @@ class ReplayStream:
 
     def __init__(self, replay_buffer: ReplayBuffer, device: torch.device) -> None:
         self.replay_buffer, self.device = replay_buffer, device
-        self.batches = 0
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         while True:
-            batch = self.replay_buffer.sample().to(self.device, non_blocking=True)
-            self.batches += 1
-            yield batch
+            yield self.replay_buffer.sample().to(self.device, non_blocking=True)
 
     def state_dict(self) -> dict[str, Any]:
-        """The number of batches drawn."""
-        return {"batches": self.batches}
+        """The position: batches handed out, and of how many clips and which size."""
+        return self.replay_buffer.state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continues after the batches already drawn."""
-        self.batches = int(state_dict["batches"])
-        self.replay_buffer.seek(self.batches)
+        """Continues after the batches already handed out.
+
+        Raises:
+            ValueError: the position belongs to another number of clips or another batch size.
+        """
+        self.replay_buffer.load_state_dict(state_dict)
 
     def set_seed(self, seed: int) -> int:
         """The sampler carries its own seed."""

@@ -1,0 +1,9 @@
+"""Sphinx configuration."""
+
+project = "torchrl_ficreg"
+author = "The torchrl_ficreg authors"
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+html_theme = "alabaster"
+nitpicky = False

@@ -1,0 +1,233 @@
+"""Claims about the losses as TorchRL modules: keys, dispatch, state, modes, copies, errors."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+
+from torchrl_ficreg import CausalPredictor, ConvEncoder, FICRegLoss, InverseDynamicsModel, LeWMLoss, SIGReg
+
+
+def values(loss, *args, **kwargs):
+    torch.manual_seed(0)
+    return loss(*args, **kwargs)
+
+
+@pytest.fixture(params=["lewm", "ficreg"])
+def loss(request, make_lewm, make_ficreg):
+    return {"lewm": make_lewm, "ficreg": make_ficreg}[request.param]()
+
+
+def test_building_a_loss_warns_of_nothing(networks):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        FICRegLoss(*networks())
+
+
+def test_the_clip_is_left_alone(loss, make_clip):
+    clip = make_clip()
+    clip["mask"] = torch.rand(8, 3) > 0.3
+    before = clip.clone()
+    sum(values(loss, clip).values()).backward()
+    assert set(clip.keys()) == {"pixels", "action", "mask"}
+    assert (clip == before).all()
+
+
+def test_it_can_be_called_by_keyword(loss, make_clip):
+    clip = make_clip()
+    output = values(loss, **clip)
+    assert loss.in_keys == ["pixels", "action"]
+    for value, expected in zip(output, (values(loss, clip)[key] for key in loss.out_keys), strict=True):
+        assert value.equal(expected)
+
+
+def test_every_key_can_be_renamed_nested_too(loss, make_clip, make_lewm):
+    clip = make_clip()
+    clip["mask"] = torch.rand(8, 3) > 0.3
+    expected = values(loss.eval(), clip)
+    renamed = TensorDict({("obs", "camera", "rgb"): clip["pixels"], ("obs", "control"): clip["action"]}, [8])
+    renamed["obs", "trusted"] = clip["mask"]
+    loss.set_keys(pixels=("obs", "camera", "rgb"), action=("obs", "control"), mask=("obs", "trusted"))
+    assert loss.in_keys == [("obs", "camera", "rgb"), ("obs", "control")]
+    torch.testing.assert_close(values(loss, renamed), expected)
+    assert make_lewm().in_keys == ["pixels", "action"]  # another loss keeps its names
+
+
+def test_an_unknown_key_is_refused(loss):
+    with pytest.raises(ValueError, match="frames is not an accepted tensordict key"):
+        loss.set_keys(frames="pixels")
+
+
+def test_networks_keep_their_own_key_names(make_ficreg, make_clip):
+    """The loss feeds networks by their in_keys and reads their out_keys, whatever these are called."""
+    reference, clip = make_ficreg(0.0), make_clip()
+    encoder, predictor, inverse_model = (getattr(reference, name).module for name in FICRegLoss._networks)
+    loss = FICRegLoss(
+        TensorDictModule(encoder, in_keys=[("obs", "rgb")], out_keys=[("belief", "mean")]),
+        TensorDictModule(predictor, in_keys=[("belief", "mean"), ("agent", "control")], out_keys=[("next", "belief")]),
+        TensorDictModule(inverse_model, in_keys=["before", ("next", "after")], out_keys=[("agent", "guess")]),
+        sigreg=SIGReg(16),
+    )
+    torch.testing.assert_close(values(loss, clip), values(reference, clip))
+
+
+class _Add(nn.Linear):
+    def forward(self, latent, action):
+        return latent + super().forward(action)
+
+
+class _Flat(nn.Module):
+    def forward(self, pixels):
+        return pixels.flatten(-3).float() / 255
+
+
+def test_networks_of_ones_own_need_only_their_keys(make_clip):
+    """A sequence of modules as encoder, a linear predictor without BatchNorm or dropout."""
+    flat = TensorDictModule(_Flat(), in_keys=["pixels"], out_keys=["flat"])
+    code = TensorDictModule(nn.Linear(768, 4), in_keys=["flat"], out_keys=["code"])
+    loss = FICRegLoss(
+        TensorDictSequential(flat, code, selected_out_keys=["code"]),
+        TensorDictModule(_Add(6, 4), in_keys=["code", "action"], out_keys=["next_code"]),
+        InverseDynamicsModel(4, 6, 8),
+        sigreg=SIGReg(4),
+    )
+    sum(values(loss, make_clip()).values()).backward()
+    assert all(param.grad is not None for param in loss.parameters())
+
+
+def test_the_constructors_can_rename_keys(make_clip):
+    loss = FICRegLoss(
+        ConvEncoder(image_size=16, channels=(4,), in_key=("a", "b"), out_key=("c", "d"), latent_dim=4),
+        CausalPredictor(latent_dim=4, action_dim=6, depth=1, width=8, in_keys=(("c", "d"), ("e", "f")), out_key=("g", "h")),
+        InverseDynamicsModel(4, 6, 8, in_keys=("past", ("c", "d")), out_key=("i", "j")),
+        sigreg=SIGReg(4),
+    )
+    assert len(values(loss, make_clip()).keys()) == 4
+
+
+def test_train_and_eval_reach_the_networks(loss, make_clip):
+    networks = [getattr(loss, name) for name in loss._networks]
+    assert all(module.training for network in networks for module in network.modules())
+    assert loss.eval() is loss
+    assert not any(module.training for network in networks for module in network.modules())
+    before = copy.deepcopy(loss.state_dict())
+    assert values(loss, make_clip())["loss_pred"].equal(values(loss, make_clip())["loss_pred"])
+    assert all(value.equal(before[key]) for key, value in loss.state_dict().items())  # no statistic moved
+    loss.train()
+    assert all(module.training for network in networks for module in network.modules())
+
+
+def test_the_optimiser_gets_every_parameter_once(loss):
+    params = list(loss.parameters())
+    expected = [param for name in loss._networks for param in getattr(loss, name).parameters()]
+    assert len(params) == len(set(params)) == len(expected)
+    assert set(params) == set(expected)  # the networks' own: what is trained is what plans
+
+
+def test_a_state_dict_carries_everything(make_ficreg, make_clip):
+    trained, fresh, clip = make_ficreg(idm_coeff=0.7), make_ficreg(), make_clip()
+    optimizer = torch.optim.Adam(trained.parameters(), 0.01)
+    sum(values(trained, clip).values()).backward()
+    optimizer.step()
+    fresh.load_state_dict(trained.state_dict())
+    torch.testing.assert_close(values(fresh.eval(), clip), values(trained.eval(), clip), rtol=0, atol=0)
+    for name in FICRegLoss._networks:
+        ours, theirs = getattr(fresh, name).state_dict(), getattr(trained, name).state_dict()
+        assert all(ours[key].equal(theirs[key]) for key in theirs)
+
+
+def test_a_deep_copy_stands_alone(make_ficreg, make_clip):
+    """Training a copy changes its own judge and nothing of the original."""
+    original, clip = make_ficreg().eval(), make_clip()
+    expected = values(original, clip)
+    duplicate = copy.deepcopy(original)
+    torch.testing.assert_close(values(duplicate, clip), expected, rtol=0, atol=0)
+    with torch.no_grad():
+        for param in duplicate.inverse_model_params.parameters():
+            param.add_(1.0)
+    changed = values(duplicate, clip)
+    assert changed["loss_idm"] > 2 * expected["loss_idm"]
+    assert changed["loss_consistency"] > 2 * expected["loss_consistency"]
+    torch.testing.assert_close(values(original, clip), expected, rtol=0, atol=0)
+
+
+class _Fails(nn.Linear):
+    """A network that runs out of memory at its n-th call."""
+
+    def __init__(self, width_in, width_out, at):
+        super().__init__(width_in, width_out)
+        self.norm, self.at, self.calls = nn.BatchNorm1d(width_out), at, 0
+
+    def forward(self, *inputs):
+        self.calls += 1
+        if self.calls == self.at:
+            raise torch.OutOfMemoryError("no memory left")
+        result = super().forward(torch.cat(inputs, -1))
+        return self.norm(result.flatten(0, -2)).unflatten(0, result.shape[:-1])
+
+
+@pytest.mark.parametrize("failing", ["predictor", "inverse_model"])
+@pytest.mark.parametrize("at", [1, 2])
+def test_an_error_inside_leaves_the_networks_usable(networks, make_clip, failing, at):
+    """Catch, make the batch smaller, go on: no frozen weight and no borrowed buffer stays behind."""
+    encoder, predictor, inverse_model = networks()
+    if failing == "predictor":
+        predictor = TensorDictModule(_Fails(12, 6, at), ["latent", "action"], ["predicted_latent"])
+    else:
+        inverse_model = TensorDictModule(_Fails(12, 6, at), ["latent", "next_latent"], ["recovered_action"])
+    loss = FICRegLoss(encoder, predictor, inverse_model, sigreg=SIGReg(4))
+    network = getattr(loss, failing)
+    params, buffers = list(network.parameters()), dict(network.named_buffers())
+    with pytest.raises(torch.OutOfMemoryError):
+        loss(make_clip())
+    assert [id(param) for param in network.parameters()] == [id(param) for param in params]
+    assert all(param.requires_grad for param in network.parameters())
+    assert all(value.data_ptr() == buffers[key].data_ptr() for key, value in network.named_buffers())
+    sum(loss(make_clip()).values()).backward()
+    assert all(param.grad is not None for param in params)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (lambda c: c.exclude("pixels"), KeyError, "no 'pixels', only action"),
+        (lambda c: c.exclude("action"), KeyError, "no 'action', only pixels"),
+        (lambda c: c[:, :1], ValueError, "at least 2 frames"),
+        (lambda c: c[0], ValueError, r"pixels \[B, T, 3, H, W\]"),
+        (lambda c: c.set("action", c["action"][..., :4]), ValueError, "6 wide .* got 4: check frame_skip"),
+        (lambda c: TensorDict({**c, "action": c["action"][:, :2]}, [8]), ValueError, "every frame has an action block"),
+        (lambda c: c.set("pixels", c["pixels"].long()), TypeError, "uint8 .* or floating .* got torch.int64"),
+        (lambda c: c.set("pixels", c["pixels"][..., :8]), ValueError, r"pixels must be \[..., 3, 16, 16\]"),
+        (lambda c: torch.cat([c, c], 1), ValueError, "sees 1 to 2 latents, got 5"),
+        (lambda c: c.set("mask", torch.ones(8, 3, 1, dtype=torch.bool)), ValueError, r"expected \[8, 3\] bool, got \[8, 3, 1\]"),
+        (lambda c: TensorDict({**c, "mask": torch.ones(8, 1, dtype=torch.bool)}, [8]), ValueError, r"got \[8, 1\]"),
+        (lambda c: c.set("mask", torch.ones(8, 3)), ValueError, "got .* torch.float32"),
+    ],
+)
+def test_a_wrong_clip_is_refused_and_a_right_one_taken_afterwards(loss, make_clip, change, error, message):
+    with pytest.raises(error, match=message):
+        loss(change(make_clip()))
+    sum(loss(make_clip()).values()).backward()
+    assert all(param.grad is not None for param in loss.parameters())
+
+
+def test_a_mask_of_another_shape_is_not_broadcast_into_an_empty_loss(make_ficreg, make_clip):
+    """With two frames, [B, 2, 1] cut by one would broadcast every term away."""
+    clip = make_clip(frames=2)
+    clip["mask"] = torch.ones(8, 2, 1, dtype=torch.bool)
+    with pytest.raises(ValueError, match="mask"):
+        make_ficreg()(clip)
+
+
+def test_unknown_choices_are_refused(networks):
+    with pytest.raises(ValueError, match="unknown context 'dead': choose 'detached' or 'live'"):
+        FICRegLoss(*networks(), context="dead")
+    for build in (lambda: LeWMLoss(*networks()[:2], reduction="max"), lambda: FICRegLoss(*networks(), reduction="max")):
+        with pytest.raises(ValueError, match="unknown reduction 'max': choose 'mean', 'sum' or 'none'"):
+            build()

@@ -49,8 +49,9 @@ def main(cfg: DictConfig) -> None:
     check_settings(cfg)
     run_dir = claim_run_dir(cfg)
     data = collect_dataset(cfg)
+    pairs = draw_pairs(cfg, data)  # before training: too few episodes shall not come to light after it
     model, card, training = train(cfg, data, run_dir)
-    results = {**evaluate(cfg, data, run_dir, model, card), "training": training, "versions": versions()}
+    results = {**evaluate(cfg, data, run_dir, model, card, pairs), "training": training, "versions": versions()}
     write_json(run_dir / "results.json", results)
     report(results, cfg.method.name, run_dir)
 
@@ -89,14 +90,20 @@ def train(cfg: DictConfig, data: Path, run_dir: Path) -> tuple[LatentWorldModel,
     return model.eval(), card, training
 
 
-def evaluate(cfg: DictConfig, data: Path, run_dir: Path, model: LatentWorldModel, card: ModelCard) -> dict:
+def draw_pairs(cfg: DictConfig, data: Path) -> StartGoalPairs:
+    """The frozen start-goal pairs beside the dataset."""
+    held_out = make_dataset(cfg, data, "evaluation", drop_last=False)
+    count, offset, seed = cfg.evaluation.num_pairs, cfg.env.goal_offset, cfg.evaluation.seed
+    manifest = data / f"pairs_{count}x{offset}_seed{seed}.json"
+    return StartGoalPairs.frozen(manifest, held_out, cfg.env.name, count, offset, seed)
+
+
+def evaluate(
+    cfg: DictConfig, data: Path, run_dir: Path, model: LatentWorldModel, card: ModelCard, pairs: StartGoalPairs
+) -> dict:
     """Plans on the frozen pairs, looks at the latent space, draws the pictures."""
     held_out = make_dataset(cfg, data, "evaluation", drop_last=False)
     settings = cfg.evaluation
-    manifest = f"pairs_{settings.num_pairs}x{cfg.env.goal_offset}_seed{settings.seed}.json"
-    pairs = StartGoalPairs.frozen(
-        data / manifest, held_out, card.env, settings.num_pairs, cfg.env.goal_offset, settings.seed
-    )
     pairs.save(run_dir / "pairs.json")
     shared = {
         "budget": cfg.env.budget,
@@ -120,9 +127,10 @@ def report(results: dict, method: str, run_dir: Path) -> None:
     for name in (method, "random"):
         row = results[name]
         low, high = row["success_interval"]
+        unsolved = row["success_rate_unsolved_at_start"]  # None where every pair was solved at the start
         print(
             f"{name:<10}{row['success_rate']:>9.1%}{f'{low:.1%} - {high:.1%}':>18}{row['success_rate_at_end']:>12.1%}"
-            f"{row['success_rate_unsolved_at_start']:>19.1%}{row['seconds_per_plan']:>10.2f}"
+            f"{'-' if unsolved is None else f'{unsolved:.1%}':>19}{row['seconds_per_plan']:>10.2f}"
         )
     print(f"{results[method]['pairs']} frozen held-out pairs; results and pictures in {run_dir}")
 

@@ -20,7 +20,10 @@ from torchrl_ficreg import FICRegLoss, LatentCEMPlanner, LatentWorldModel, LeWML
 from torchrl_ficreg.data import EpisodeWriter, OfflineTrajectories
 from torchrl_ficreg.envs import collect_episodes, make_env
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
+from torchrl_ficreg.modules.precision import uses_bf16
 from torchrl_ficreg.trainers import ModelCard
+from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS
+from torchrl_ficreg.trainers.offline import METRICS
 
 
 def get_device(name: str) -> torch.device:
@@ -178,20 +181,31 @@ def check_settings(cfg: DictConfig) -> None:
     positive |= {"env.budget": cfg.env.budget, "env.goal_offset": cfg.env.goal_offset}
     positive |= {"evaluation.num_pairs": evaluation.num_pairs, "evaluation.num_envs": evaluation.num_envs}
     positive |= {"evaluation.record": evaluation.record, "logger.interval": cfg.logger.interval}
+    positive |= {"optim.validation_batches": optim.validation_batches, "env.data.max_steps": cfg.env.data.max_steps}
     wrong = [f"{key}={value}" for key, value in positive.items() if not value > 0]
     if wrong:
         raise ValueError(f"must be positive: {', '.join(wrong)}.")
+    natural = {"seed": cfg.seed, "env.data.seed": cfg.env.data.seed, "evaluation.seed": evaluation.seed}
+    natural |= {"collect.num_workers": cfg.collect.num_workers, "optim.weight_decay": optim.weight_decay}
+    wrong = [f"{key}={value}" for key, value in natural.items() if not value >= 0]
+    if wrong:
+        raise ValueError(f"must not be negative: {', '.join(wrong)}.")
+    if not 0 <= optim.warmup < 1:
+        raise ValueError(f"optim.warmup must lie in [0, 1), got {optim.warmup}.")
+    for precision in (optim.precision, cfg.plan.precision):
+        uses_bf16("cpu", precision)
+    make_env(cfg.env.name, **OmegaConf.to_container(cfg.env.kwargs)).close()
 
 
 def claim_run_dir(cfg: DictConfig) -> Path:
-    """The run's folder, which belongs to one configuration for good.
+    """The run's folder, which belongs to one configuration as soon as that one has trained.
 
     Raises:
         ValueError: it holds a run of another configuration.
     """
     run_dir, ours = Path(cfg.runs_dir) / cfg.name, OmegaConf.to_container(cfg, resolve=True)
     path = run_dir / "config.yaml"
-    if path.exists():
+    if path.exists() and ((run_dir / METRICS).exists() or (run_dir / CHECKPOINTS).exists()):
         theirs = OmegaConf.to_container(OmegaConf.load(path))
         differ = sorted(key for key in _flat(ours) | _flat(theirs) if _flat(ours).get(key) != _flat(theirs).get(key))
         differ = [key for key in differ if not key.startswith(("collect.", "device", "evaluation.", "plan."))]

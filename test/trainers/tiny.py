@@ -34,7 +34,7 @@ LOW, HIGH = [-4.0, -4.0], [4.0, 4.0]
 
 
 def make_data(split: str = "train", *, episodes: int = 10, **settings) -> OfflineTrajectories:
-    """Random pictures and actions; 8 training episodes of 22 clips, hence 11 batches of 16 an epoch."""
+    """Random pictures and actions; 7 training episodes of 22 clips, hence 9 batches of 16 an epoch."""
     rng = np.random.default_rng(0)
     recorded = [
         {
@@ -96,8 +96,10 @@ def finite(tensors: dict[str, torch.Tensor]) -> bool:
 
 def run(run_dir: Path, weights_file: Path) -> None:
     """One start of the command: continues where the last one was killed, then leaves its weights."""
-    trainer = make_trainer(run_dir, data=make_data(prefetch=1))
+    trainer = make_trainer(run_dir, data=make_data(prefetch=1), epochs=6)
     trainer.resume()
+    with open(weights_file.with_suffix(".starts"), "a") as file:
+        file.write(f"{trainer.step}\n")
     trainer.train()
     part = weights_file.with_suffix(".part")
     torch.save(weights(trainer), part)

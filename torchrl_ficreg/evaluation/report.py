@@ -32,6 +32,7 @@ def plot_learning_curve(metrics: Path, target: Path) -> None:
 
     Raises:
         ImportError: matplotlib is missing.
+        ValueError: the table holds no loss.
     """
     pyplot = _pyplot()
     curves: dict[str, dict[str, list[tuple[int, float]]]] = defaultdict(lambda: defaultdict(list))
@@ -40,6 +41,8 @@ def plot_learning_curve(metrics: Path, target: Path) -> None:
             for key, value in row.items():
                 if key.startswith("loss_") and value:
                     curves[key][row["split"]].append((int(row["step"]), float(value)))
+    if not curves:
+        raise ValueError(f"{metrics} holds no loss: give the metrics.csv of a run that has begun to train.")
     figure, axes = pyplot.subplots(1, len(curves), figsize=(3.4 * len(curves), 2.8), squeeze=False)
     for axis, (term, splits) in zip(axes[0], sorted(curves.items())):
         for split, style in (("train", {"lw": 1}), ("validation", {"marker": "o", "ls": "", "ms": 4})):

@@ -28,11 +28,18 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
 
 
 def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Spearman's rank correlation of two samples [N].
+    """Spearman's rank correlation of two samples [N]; equal values share their mean rank.
+
+    0 where one sample is constant, for then there is nothing to follow.
 
     Examples:
         >>> float(rank_correlation(np.array([1.0, 2.0, 5.0]), np.array([0.0, 3.0, 4.0])))
         1.0
     """
-    ranks = [np.argsort(np.argsort(values, kind="stable")) for values in (first, second)]
+    ranks = []
+    for values in (first, second):
+        _, which, count = np.unique(values, return_inverse=True, return_counts=True)
+        if len(count) == 1:
+            return 0.0
+        ranks.append((np.cumsum(count) - (count - 1) / 2)[which])
     return float(np.corrcoef(*ranks)[0, 1])

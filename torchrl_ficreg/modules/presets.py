@@ -41,7 +41,8 @@ class ModelConfig:
         if self.encoder not in ("vit", "conv"):
             raise ValueError(f"unknown encoder {self.encoder!r}: choose 'vit' or 'conv'.")
         sizes = {name: value for name, value in asdict(self).items() if name not in ("encoder", "predictor_dropout")}
-        small = [name for name, value in sizes.items() if min(value if isinstance(value, tuple) else (value,)) < 1]
+        sizes = {name: value if isinstance(value, tuple) else (value,) for name, value in sizes.items()}
+        small = [name for name, values in sizes.items() if min(values, default=0) < 1]
         if small:
             raise ValueError(f"model sizes must be positive, got {', '.join(f'{n}={getattr(self, n)}' for n in small)}.")
         if not 0 <= self.predictor_dropout < 1:

@@ -95,16 +95,21 @@ class LatentWorldModel(TensorDictModuleBase):
             predicted latents [..., N, D].
 
         Raises:
-            ValueError: no block to imagine, or leading dimensions that differ.
+            ValueError: no block to imagine, leading dimensions that differ, or a wrong width.
         """
-        context, blocks = latent.shape[-2], action.shape[-2]
-        steps = blocks - context + 1
-        if context < 1 or steps < 1 or latent.shape[:-2] != action.shape[:-2]:
+        network = self.predictor.module
+        if not (
+            min(latent.ndim, action.ndim) >= 2
+            and latent.shape[:-2] == action.shape[:-2]
+            and 1 <= latent.shape[-2] <= action.shape[-2]
+            and latent.shape[-1] == network.latent_dim
+        ):
             raise ValueError(
-                f"rollout takes latents [..., C, D] and C - 1 + N action blocks [..., C - 1 + N, F * A], "
-                f"got {list(latent.shape)} and {list(action.shape)}."
+                f"rollout takes latents [..., C, {network.latent_dim}] and C - 1 + N action blocks "
+                f"[..., C - 1 + N, F * A], N >= 1, got {list(latent.shape)} and {list(action.shape)}."
             )
-        network, lead = self.predictor.module, latent.shape[:-2]
+        lead, context, blocks = latent.shape[:-2], latent.shape[-2], action.shape[-2]
+        steps = blocks - context + 1
         window = list(latent.reshape(-1, context, latent.shape[-1]).unbind(1))  # C x [N, D]
         modulation = network.modulation(action.reshape(-1, blocks, action.shape[-1]))  # [depth, N, blocks, 6 * width]
         for end in range(context, context + steps):

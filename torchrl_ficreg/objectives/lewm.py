@@ -178,8 +178,8 @@ class _Clip:
         if mask is not None:
             if mask.shape != pixels.shape[:-3] or mask.dtype != torch.bool:
                 raise ValueError(
-                    f"a mask says of every frame's action block whether to trust it: expected {list(pixels.shape[:-3])} "
-                    f"bool, got {list(mask.shape)} {mask.dtype}."
+                    f"a mask says of every action block whether to trust it: expected {list(pixels.shape[:-3])} bool, "
+                    f"got {list(mask.shape)} {mask.dtype}."
                 )
             mask = mask[..., :-1]
             action = torch.where(mask.unsqueeze(-1), action, 0.0)

@@ -138,6 +138,7 @@ class OfflineTrainer(Trainer):
                     f"{latest} cannot be continued ({error}): repeat the settings it was made with, or, if it is "
                     "damaged, move it away to continue from the one before."
                 ) from error
+            _align(self.optimizer)
         self._sweep()
         self.metrics_table.drop_after(self.step)
         return latest is not None
@@ -146,7 +147,7 @@ class OfflineTrainer(Trainer):
         """Removes what a killed process left half-written beside its checkpoints."""
         if self.checkpoint_rotation is None:
             return
-        for pattern in (".*.stage-*", ".*.archive-*"):
+        for pattern in (".*.stage-*", ".*.archive-*", ".*.delete-*"):
             for left in self.checkpoint_rotation.directory.glob(pattern):
                 shutil.rmtree(left) if left.is_dir() else left.unlink()
 
@@ -154,6 +155,18 @@ class OfflineTrainer(Trainer):
         """Runs to the end, or not at all when the resumed run had reached it."""
         if self.step < self.total_steps:
             super().train()
+
+
+def _align(optimizer: torch.optim.Optimizer) -> None:
+    """Lays loaded moments out in memory as their parameters are.
+
+    A checkpoint keeps values, not strides, and the fused AdamW walks over raw memory: beside a channels-last weight,
+    contiguous moments would meet the wrong elements.
+    """
+    for parameter, state in optimizer.state.items():
+        for key, value in state.items():
+            if torch.is_tensor(value) and value.shape == parameter.shape:
+                state[key] = torch.empty_like(parameter, requires_grad=False).copy_(value)
 
 
 class WarmupCosine:

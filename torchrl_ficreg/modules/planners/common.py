@@ -55,15 +55,17 @@ class PlanConfig:
             raise ValueError(f"std must be positive, got {self.std}.")
         if self.bounds not in ("environment", "none"):
             raise ValueError(f"unknown bounds {self.bounds!r}: choose 'environment' or 'none'.")
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}.")
+        uses_bf16("cpu", self.precision)  # refuses an unknown one
 
 
 class LatentPlanner(MPCPlannerBase):
     """Dynamics x cost x search: plans in latent space and never sees an environment.
 
-    Reads ``latent`` [E, D] (or [E, C, D], the last C frames with C - 1 executed blocks between them) and
-    ``goal_latent`` [E, D]; ``plan_seed`` [E] int64 names the random draws of each environment and defaults to
-    0, 1, ... Writes ``plan`` [E, horizon, F * A] z-scored, its predicted ``plan_cost`` [E] and, as TorchRL's planners
-    do, the first block as ``action`` [E, F * A].
+    Reads ``latent`` [E, D] and ``goal_latent`` [E, D]; ``plan_seed`` [E] int64 names the random draws of each
+    environment and defaults to 0, 1, ... Writes ``plan`` [E, horizon, F * A] z-scored, its predicted ``plan_cost`` [E]
+    and, as TorchRL's planners do, the first block as ``action`` [E, F * A].
 
     Every environment draws from a generator of its own, on the CPU. On CPUs the search runs environment by environment
     as well (300 candidates fill the cores), so there a plan is the same to the last bit alone or among fifty;
@@ -141,21 +143,25 @@ class LatentPlanner(MPCPlannerBase):
         """Searches a plan for every environment.
 
         Args:
-            latent: [E, D], or [E, C, D].
+            latent: [E, D].
             goal: [E, D].
             seeds: [E] int64, names of the random draws.
 
         Returns:
             ``plan`` [E, horizon, F * A], z-scored, and ``plan_cost`` [E], the cost predicted for it.
+
+        Raises:
+            ValueError: other shapes, or a world model in train mode.
         """
-        if latent.ndim == 2:
-            latent = latent.unsqueeze(1)  # [E, 1, D]
+        if self.world_model.encoder.training or self.world_model.predictor.training:
+            raise ValueError("the world model is in train mode, where dropout blurs every plan: call its eval().")
         seeds = range(len(latent)) if seeds is None else seeds.flatten().tolist()
-        if goal.shape != (len(latent), latent.shape[-1]) or len(seeds) != len(latent):
+        if latent.ndim != 2 or goal.shape != latent.shape or len(seeds) != len(latent):
             raise ValueError(
                 f"expected latents [E, D], goals [E, D] and seeds [E], got {list(latent.shape)}, {list(goal.shape)} "
                 f"and {len(seeds)}."
             )
+        latent = latent.unsqueeze(1)  # [E, 1, D]: a context of one frame
         group = 1 if latent.device.type == "cpu" else max(1, len(latent))
         with self._dynamics_in_precision(latent.device):
             results = [
@@ -180,7 +186,7 @@ class LatentPlanner(MPCPlannerBase):
 
     @abc.abstractmethod
     def _search(self, latent: torch.Tensor, goal: torch.Tensor, seeds: list[int]) -> TensorDict:
-        """Latents [e, C, D], goals [e, D], e seeds -> ``plan`` [e, horizon, F * A] and ``plan_cost`` [e]."""
+        """Latents [e, 1, D], goals [e, D], e seeds -> ``plan`` [e, horizon, F * A] and ``plan_cost`` [e]."""
 
     def _noise(self, seeds: list[int], shape: tuple[int, ...], like: torch.Tensor) -> torch.Tensor:
         """Standard normal draws [e, *shape] float32, each environment's from its own generator."""
@@ -192,8 +198,8 @@ class LatentPlanner(MPCPlannerBase):
         return torch.stack(draws).to(like.device)
 
     def _imagined_cost(self, latent: torch.Tensor, goal: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Cost [e, K] of candidates [e, K, horizon, F * A] from latents [e, C, D]."""
-        start = latent.unsqueeze(1).expand(-1, action.shape[1], -1, -1)  # [e, K, C, D]
+        """Cost [e, K] of candidates [e, K, horizon, F * A] from latents [e, 1, D]."""
+        start = latent.unsqueeze(1).expand(-1, action.shape[1], -1, -1)  # [e, K, 1, D]
         dtype = self.world_model.predictor.module.position.dtype
         predicted = self.world_model.rollout(start.to(dtype), action.to(dtype))  # [e, K, horizon, D]
         return self.cost(predicted.float(), goal)

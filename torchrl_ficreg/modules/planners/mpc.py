@@ -48,7 +48,7 @@ class MPCPolicy(TensorDictModuleBase):
         memory = self._memory(td)
         used_up = memory["cursor"] >= memory["queue"].shape[1]  # [E]
         if used_up.any():
-            memory[used_up] = self._plan(td[used_up], memory[used_up], self._seeds(td)[used_up])
+            memory[used_up] = self._plan(td[used_up], memory[used_up], self._seeds(td)[used_up.cpu()])
         step = memory["cursor"]  # [E]
         action = memory["queue"][torch.arange(len(step), device=step.device), step]  # [E, A]
         memory["cursor"] = step + 1

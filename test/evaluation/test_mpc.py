@@ -1,0 +1,177 @@
+"""Success rates: an oracle gets 100 %, outcomes belong to the pair alone, and every way of counting is kept apart."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from scenes import make_pairs, same_room_pairs, Walker
+
+from torchrl_ficreg import LatentCEMPlanner, make_world_model, ModelConfig, MPCPolicy, PlanConfig
+from torchrl_ficreg.envs.two_room import render
+from torchrl_ficreg.evaluation import evaluate_mpc, UniformPolicy
+
+BOX = ([-1.0, -1.0], [1.0, 1.0])
+
+
+def evaluate(policy, pairs, **settings):
+    return evaluate_mpc(policy, pairs, **{"budget": 8, "image_size": 16, "progress_bar": False, **settings})
+
+
+@pytest.fixture(scope="module")
+def planner():
+    """CEM over a tiny untrained model: it plans badly, but it plans."""
+    torch.manual_seed(0)
+    sizes = ModelConfig(
+        encoder="conv",
+        image_size=16,
+        frame_skip=2,
+        latent_dim=4,
+        history=1,
+        conv_channels=(4, 8),
+        predictor_depth=1,
+        predictor_width=16,
+        predictor_heads=2,
+        predictor_dim_head=8,
+    )
+    model, _ = make_world_model(sizes, action_dim=2)
+    config = PlanConfig(num_candidates=16, num_elites=4, iterations=2, horizon=2, receding_horizon=1)
+    return MPCPolicy(LatentCEMPlanner(model.eval(), config, action_bounds=BOX))
+
+
+@pytest.mark.parametrize("num_envs", [1, 3, 50])
+def test_an_oracle_reaches_every_goal_and_stays(num_envs):
+    outcome = evaluate(Walker(), same_room_pairs(), budget=40, num_envs=num_envs)
+    assert outcome.success_rate == 1
+    assert outcome.success[:, -1].all() and not outcome.at_start.any()
+
+
+def test_the_oracle_arrives_when_physics_says():
+    """80 px at 5 px a step, reached closer than 16 px: 60 is at 13 steps (65 px walked, 15 left), not before."""
+    outcome = evaluate(Walker(), make_pairs([[60, 60]], [[60, 140]]), budget=20)
+    assert outcome.success[0].argmax() == 13
+    assert outcome.summary()["first_success_step"] == [13]
+    assert evaluate(Walker(), make_pairs([[60, 60]], [[60, 140]]), budget=12).success_rate == 0
+
+
+@pytest.mark.parametrize("policy", ["random", "planner"])
+def test_an_outcome_does_not_depend_on_how_many_run_side_by_side(policy, planner, request):
+    """1, 3 or all at once: the same frames, hence the same actions, to the last pixel."""
+    chosen = planner if policy == "planner" else UniformPolicy(*BOX)
+    pairs = same_room_pairs()
+    runs = [evaluate(chosen, pairs, num_envs=number, record=len(pairs)) for number in (1, 3, len(pairs))]
+    for other in runs[1:]:
+        assert np.array_equal(other.success, runs[0].success)
+        assert len(other.frames) == len(pairs)
+        assert all(np.array_equal(a, b) for a, b in zip(other.frames, runs[0].frames))
+        assert all(np.array_equal(a, b) for a, b in zip(other.goals, runs[0].goals))
+
+
+def test_the_pairs_of_a_subset_come_out_as_in_the_whole(planner):
+    """The first three of seven, alone: same outcome."""
+    pairs = same_room_pairs()
+    few = make_pairs(pairs.start_state[:3], pairs.goal_state[:3])
+    whole, part = (evaluate(planner, which, record=3) for which in (pairs, few))
+    assert all(np.array_equal(a, b) for a, b in zip(whole.frames[:3], part.frames))
+
+
+def test_worker_processes_change_nothing():
+    pairs = same_room_pairs(2)
+    here, there = (evaluate(UniformPolicy(*BOX), pairs, num_workers=n, record=2) for n in (None, 2))
+    assert all(np.array_equal(a, b) for a, b in zip(here.frames, there.frames))
+
+
+def test_the_global_random_state_takes_no_part(planner):
+    pairs = same_room_pairs(3)
+    runs = []
+    for seed in (0, 1):
+        torch.manual_seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        runs.append([evaluate(policy, pairs, record=3) for policy in (planner, UniformPolicy(*BOX))])
+    for first, second in zip(*runs):
+        assert all(np.array_equal(a, b) for a, b in zip(first.frames, second.frames))
+
+
+def test_the_random_floor_is_uniform_between_the_bounds_and_seeded():
+    from tensordict import TensorDict
+
+    policy = UniformPolicy([-1.0, 2.0], [1.0, 6.0], seed=3)
+    td = TensorDict({"plan_seed": torch.arange(50)}, [50])
+    actions = torch.cat([policy(td)["action"].clone() for _ in range(40)])  # [2000, 2]
+    assert (actions >= torch.tensor([-1.0, 2.0])).all() and (actions <= torch.tensor([1.0, 6.0])).all()
+    assert actions.mean(0).tolist() == pytest.approx([0, 4], abs=0.1)
+    assert actions.std(0).tolist() == pytest.approx([2 / 12**0.5, 4 / 12**0.5], rel=0.05)
+    assert len(actions.unique(dim=0)) == 2000
+    again = UniformPolicy([-1.0, 2.0], [1.0, 6.0], seed=3)(TensorDict({"plan_seed": torch.arange(50)}, [50]))["action"]
+    assert torch.equal(again, actions[:50])
+
+
+def test_reaching_a_goal_and_staying_there_are_counted_apart():
+    """A policy that always walks down passes through a goal 50 px below and is long gone at the end."""
+    outcome = evaluate(Walker(stop=False), make_pairs([[60, 40]], [[60, 90]]), budget=25)
+    assert outcome.success_rate == 1
+    assert outcome.summary()["success_rate_at_end"] == 0
+    assert outcome.success[0].nonzero()[0].tolist() == list(range(7, 14))  # |50 - 5 k| < 16
+
+
+def test_pairs_solved_at_the_start_are_counted_apart():
+    """One starts in its goal, one 20 px above it, one far away; walking down solves the first two."""
+    pairs = make_pairs([[60, 60], [60, 60], [60, 60]], [[60, 65], [60, 80], [30, 200]])
+    outcome = evaluate(Walker(stop=False), pairs, budget=4)
+    summary = outcome.summary()
+    assert outcome.at_start.tolist() == [True, False, False]
+    assert summary["solved_at_start"] == 1
+    assert summary["success_rate"] == pytest.approx(2 / 3)
+    assert summary["success_rate_unsolved_at_start"] == pytest.approx(1 / 2)
+    assert summary["first_success_step"] == [1, 1, -1]
+
+
+def test_a_goal_left_by_the_first_step_is_no_success_of_the_policy():
+    """15 px below the goal at the start and walking away."""
+    outcome = evaluate(Walker(stop=False), make_pairs([[60, 95]], [[60, 80]]), budget=3)
+    assert outcome.at_start.all() and outcome.success_rate == 0
+    assert outcome.summary()["success_rate_unsolved_at_start"] is None
+
+
+@pytest.mark.parametrize("record", [0, 2])
+def test_a_summary_is_plain_json(planner, record):
+    pairs = same_room_pairs(3)
+    summary = evaluate(planner, pairs, record=record).summary()
+    assert json.loads(json.dumps(summary, allow_nan=False)) == {**summary, "success_interval": [*summary["success_interval"]]}
+    assert summary["pairs"] == 3 and summary["budget"] == 8 and summary["pairs_hash"] == pairs.hash
+
+
+def test_only_planning_costs_planning_time(planner):
+    assert evaluate(planner, same_room_pairs(2)).seconds_per_plan > 0
+    assert evaluate(UniformPolicy(*BOX), same_room_pairs(2)).seconds_per_plan == 0
+
+
+def test_recorded_frames_are_the_rendered_states():
+    """The first frame shows the start state, the last one where the walker ended, the goal the goal state."""
+    pairs = same_room_pairs(5)
+    outcome = evaluate(Walker(), pairs, budget=40, num_envs=2, record=3)
+    assert len(outcome.frames) == len(outcome.goals) == 3
+    for i in range(3):
+        assert outcome.frames[i].shape == (41, 3, 16, 16) and outcome.frames[i].dtype == np.uint8
+        assert np.array_equal(outcome.frames[i][0], render(torch.from_numpy(pairs.start_state[i]), size=16).numpy())
+        goal = render(torch.from_numpy(pairs.goal_state[i]), size=16).numpy()
+        assert np.array_equal(outcome.goals[i], goal)
+        assert np.abs(outcome.frames[i][-1].astype(int) - goal).max() <= 1
+
+
+def test_environment_arguments_arrive():
+    """Only under the published rule is an agent at a jamb thrown back, and the two rules part ways."""
+    pairs = make_pairs([[111, 64]], [[150, 100]])
+    swept, endpoint = (
+        evaluate(Walker(stop=False), pairs, record=1, budget=2, env_kwargs={"collision": rule})
+        for rule in ("swept", "endpoint")
+    )
+    assert not np.array_equal(swept.frames[0], endpoint.frames[0])
+
+
+@pytest.mark.parametrize("setting", [{"budget": 0}, {"num_envs": 0}])
+def test_settings_out_of_range_are_refused(setting):
+    with pytest.raises(ValueError, match="must be positive"):
+        evaluate(Walker(), same_room_pairs(1), **setting)

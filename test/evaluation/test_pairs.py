@@ -1,0 +1,142 @@
+"""Start-goal pairs: legal, held out, reproducible, and frozen to the last bit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from scenes import make_dataset, same_room_pairs
+
+from torchrl_ficreg.data import split_episodes
+from torchrl_ficreg.evaluation import StartGoalPairs
+
+DRAW = {"env": "two_room", "num_pairs": 20, "goal_offset": 5, "seed": 0}
+
+
+def test_goals_lie_exactly_the_offset_later_in_the_same_held_out_episode():
+    """States name their episode and step, so that every pair can be checked against what was recorded."""
+    pairs = StartGoalPairs.draw(make_dataset(), **DRAW)
+    held_out = set(split_episodes(40, "evaluation").tolist())
+    assert set(pairs.episode.tolist()) <= held_out
+    assert np.array_equal(pairs.start_state[:, 0], pairs.episode + 1 / 3)
+    assert np.array_equal(pairs.start_state[:, 1], pairs.step + 1 / 7)
+    assert np.array_equal(pairs.goal_state[:, 0], pairs.episode + 1 / 3)
+    assert np.array_equal(pairs.goal_state[:, 1], pairs.step + 5 + 1 / 7)
+    assert pairs.start_state.dtype == np.float64
+
+
+def test_all_legal_starts_are_drawn_once_when_all_are_asked_for():
+    """An episode of L rows has L - offset starts, the last of which has the last row as its goal."""
+    data = make_dataset()
+    table = data.episodes
+    legal = {
+        (int(episode), step)
+        for episode, length in zip(table["episode"], table["length"])
+        for step in range(int(length) - 5)
+    }
+    pairs = StartGoalPairs.draw(data, "two_room", len(legal), 5, seed=3)
+    assert sorted(zip(pairs.episode.tolist(), pairs.step.tolist())) == sorted(legal)
+    with pytest.raises(ValueError, match=f"cannot draw {len(legal) + 1} pairs .* have {len(legal)} such starts"):
+        StartGoalPairs.draw(data, "two_room", len(legal) + 1, 5, seed=3)
+
+
+def test_short_draws_do_not_repeat_and_reach_every_episode():
+    """Over 200 seeds every legal start comes up about equally often."""
+    data, count = make_dataset(), {}
+    for seed in range(200):
+        pairs = StartGoalPairs.draw(data, "two_room", 10, 5, seed)
+        keys = list(zip(pairs.episode.tolist(), pairs.step.tolist()))
+        assert len(set(keys)) == 10
+        for key in keys:
+            count[key] = count.get(key, 0) + 1
+    total = int((data.episodes["length"] - 5).sum())
+    assert len(count) == total
+    assert max(count.values()) < 2 * 2000 / total
+
+
+@pytest.mark.parametrize(("number", "offset"), [(0, 5), (4, 0), (4, 100), (4, -3)])
+def test_impossible_draws_are_refused(number, offset):
+    with pytest.raises(ValueError, match="cannot draw .* Collect more episodes, or ask for fewer pairs"):
+        StartGoalPairs.draw(make_dataset(), "two_room", number, offset, 0)
+
+
+def test_the_seed_and_nothing_else_decides():
+    first, again, other = (StartGoalPairs.draw(make_dataset(), **{**DRAW, "seed": seed}) for seed in (0, 0, 1))
+    np.random.seed(7)  # noqa: NPY002  the global state takes no part
+    assert first.hash == again.hash == StartGoalPairs.draw(make_dataset(), **DRAW).hash
+    assert other.hash != first.hash
+    assert not np.array_equal(other.start_state, first.start_state)
+
+
+def test_the_hash_changes_with_every_single_field_and_with_the_last_bit_of_a_state():
+    pairs = same_room_pairs()
+    hashes = {pairs.hash}
+    for field in fields(pairs):
+        value = getattr(pairs, field.name)
+        if isinstance(value, np.ndarray) and value.dtype == np.float64:
+            changed = value.copy()
+            changed[-1, -1] = np.nextafter(changed[-1, -1], np.inf)
+        elif isinstance(value, np.ndarray):
+            changed = value.copy()
+            changed[-1] += 1
+        else:
+            changed = value + (1 if isinstance(value, int) else "x")
+        hashes.add(replace(pairs, **{field.name: changed}).hash)
+    assert len(hashes) == 1 + len(fields(pairs))
+
+
+def test_a_manifest_keeps_every_bit(tmp_path):
+    """Thirds, the smallest double, a large one and a negative zero come back as they were."""
+    pairs = same_room_pairs(2)
+    odd = replace(pairs, start_state=np.array([[1 / 3, 5e-324], [-0.0, 1.7976931348623157e308]]))
+    odd.save(tmp_path / "deep" / "pairs.json")
+    back = StartGoalPairs.load(tmp_path / "deep" / "pairs.json")
+    assert back.start_state.tobytes() == odd.start_state.tobytes()
+    assert back.goal_state.tobytes() == odd.goal_state.tobytes()
+    assert back.hash == odd.hash and len(back) == 2
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["pairs.json"]
+
+
+@pytest.mark.parametrize("field", ["start_state", "goal_state", "episode", "step", "seed", "goal_offset", "env", "hash"])
+def test_a_manifest_changed_by_hand_is_refused(tmp_path, field):
+    path = tmp_path / "pairs.json"
+    same_room_pairs().save(path)
+    content = json.loads(path.read_text())
+    if field.endswith("state"):
+        content[field][2][0] += 1e-9
+    elif field in ("episode", "step"):
+        content[field][0] += 1
+    else:
+        content[field] = content[field] + (1 if isinstance(content[field], int) else "0")
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="was changed after it was drawn"):
+        StartGoalPairs.load(path)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "3", "null", "{}", '{"hash": "x"}', "\udcff", '{"hash":1,"extra":2}'])
+def test_what_is_no_manifest_is_refused_by_its_path(tmp_path, text):
+    path = tmp_path / "pairs.json"
+    path.write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(ValueError, match="pairs.json is not a manifest"):
+        StartGoalPairs.load(path)
+
+
+def test_frozen_pairs_are_drawn_once_and_read_ever_after(tmp_path):
+    path = tmp_path / "pairs.json"
+    first = StartGoalPairs.frozen(path, make_dataset(), **DRAW)
+    written = path.read_bytes()
+    again = StartGoalPairs.frozen(path, make_dataset(), **DRAW)
+    assert first.hash == again.hash
+    assert path.read_bytes() == written
+
+
+def test_frozen_pairs_of_another_draw_or_dataset_are_refused(tmp_path):
+    path = tmp_path / "pairs.json"
+    StartGoalPairs.frozen(path, make_dataset(), **DRAW)
+    for change in ({"num_pairs": 19}, {"goal_offset": 4}, {"seed": 1}, {"env": "push_t"}):
+        with pytest.raises(ValueError, match="another draw or dataset .* move it away"):
+            StartGoalPairs.frozen(path, make_dataset(), **{**DRAW, **change})
+    with pytest.raises(ValueError, match="another draw or dataset"):
+        StartGoalPairs.frozen(path, make_dataset(seed=1), **DRAW)

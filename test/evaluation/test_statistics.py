@@ -1,0 +1,62 @@
+"""Intervals and correlations against published or hand-computed values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torchrl_ficreg.evaluation import rank_correlation, wilson_interval
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [
+        (81, 263, 0.2553, 0.3662),  # Newcombe (1998), Statistics in Medicine 17, table I, method 3
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0000, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+        (29, 29, 0.8830, 1.0000),  # by symmetry from 0 of 29: 0 to 0.1170
+    ],
+)
+def test_the_interval_is_the_published_one(successes, trials, low, high):
+    assert wilson_interval(successes, trials) == pytest.approx((low, high), abs=1e-4)
+
+
+def test_the_interval_is_symmetric_stays_in_bounds_and_shrinks_with_more_trials():
+    for trials in (1, 7, 100):
+        for successes in range(trials + 1):
+            low, high = wilson_interval(successes, trials)
+            assert 0 <= low <= successes / trials <= high <= 1 and low < high
+            assert wilson_interval(trials - successes, trials) == pytest.approx((1 - high, 1 - low))
+            wide, narrow = wilson_interval(successes, trials), wilson_interval(successes * 10, trials * 10)
+            assert narrow[1] - narrow[0] < wide[1] - wide[0]
+
+
+def test_no_trial_tells_nothing_and_impossible_counts_are_refused():
+    assert wilson_interval(0, 0) == (0.0, 1.0)
+    for successes, trials in ((3, 2), (-1, 5)):
+        with pytest.raises(ValueError, match=f"got {successes} of {trials}"):
+            wilson_interval(successes, trials)
+
+
+def test_rank_correlation_sees_order_only():
+    values = np.random.default_rng(0).normal(size=50)
+    assert rank_correlation(values, np.exp(values)) == pytest.approx(1)
+    assert rank_correlation(values, -(values**3)) == pytest.approx(-1)
+
+
+def test_rank_correlation_is_spearmans():
+    """Ten pupils, ranked by IQ and by hours of television (a standard textbook example): -29 / 165."""
+    iq = np.array([106, 100, 86, 101, 99, 103, 97, 113, 112, 110])
+    hours = np.array([7, 27, 2, 50, 28, 29, 20, 12, 6, 17])
+    assert rank_correlation(iq, hours) == pytest.approx(-29 / 165)
+
+
+def test_equal_values_share_their_rank():
+    """Ranks 1, 2.5, 2.5, 4 against 1, 2, 3, 4: covariance 4.5, variances 4.5 and 5."""
+    assert rank_correlation(np.array([0, 1, 1, 2]), np.arange(4)) == pytest.approx(4.5 / (4.5 * 5) ** 0.5)
+
+
+def test_a_collapsed_latent_space_correlates_with_nothing():
+    """All latent distances equal: no order, hence 0, whatever the order of the pairs."""
+    assert rank_correlation(np.arange(10), np.zeros(10)) == 0

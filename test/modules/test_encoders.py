@@ -1,0 +1,109 @@
+"""Claims about the encoders: one latent per frame whatever the dtype, the shape or the company of the frame."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_ficreg import ConvEncoder, ViTEncoder
+from torchrl_ficreg.modules.pixels import IMAGENET_MEAN, IMAGENET_STD, PixelNormalizer
+
+BUILD = {
+    "conv": lambda **kwargs: ConvEncoder(image_size=16, channels=(4, 8), projector_dim=12, latent_dim=6, **kwargs),
+    "vit": lambda **kwargs: ViTEncoder(
+        image_size=16, patch_size=8, width=12, depth=2, heads=3, mlp_dim=16, projector_dim=12, latent_dim=6, **kwargs
+    ),
+}
+
+
+@pytest.fixture(params=BUILD)
+def build(request):
+    return BUILD[request.param]
+
+
+@pytest.fixture
+def encoder(build):
+    torch.manual_seed(0)
+    return build().eval()
+
+
+def frames(*lead):
+    return torch.randint(0, 256, (*lead, 3, 16, 16), dtype=torch.uint8)
+
+
+def test_bytes_and_their_share_of_255_give_one_latent(encoder):
+    pixels = frames(5)
+    torch.testing.assert_close(encoder(pixels=pixels / 255), encoder(pixels=pixels))
+
+
+@pytest.mark.parametrize("lead", [(), (1,), (2, 4), (2, 1, 3)])
+def test_leading_dimensions_are_frames(encoder, lead):
+    pixels = frames(*lead)
+    latent = encoder(pixels=pixels)
+    assert latent.shape == (*lead, 6)
+    torch.testing.assert_close(latent.reshape(-1, 6), encoder(pixels=pixels.reshape(-1, 3, 16, 16)))
+
+
+def test_a_frame_is_encoded_as_if_alone(encoder):
+    pixels = frames(4)
+    alone = torch.cat([encoder(pixels=frame[None]) for frame in pixels])
+    torch.testing.assert_close(encoder(pixels=pixels), alone)
+
+
+def test_every_pixel_counts(encoder):
+    pixels = torch.rand(1, 3, 16, 16, requires_grad=True)
+    encoder(pixels=pixels).square().sum().backward()
+    assert (pixels.grad != 0).all()
+
+
+def test_keys_can_be_renamed_nested_too(build, encoder):
+    renamed = build(in_key=("obs", "rgb"), out_key=("belief", "z")).eval()
+    renamed.load_state_dict(encoder.state_dict())
+    pixels = frames(3)
+    assert renamed(TensorDict({("obs", "rgb"): pixels}, [3]))["belief", "z"].equal(encoder(pixels=pixels))
+
+
+def test_training_moves_the_running_statistics_of_the_projector(build):
+    encoder = build()
+    encoder(pixels=frames(2, 4))
+    assert encoder.module.projector.norm.num_batches_tracked == 1
+
+
+@pytest.mark.parametrize(
+    ("pixels", "error", "message"),
+    [
+        (torch.zeros(2, 3, 8, 16, dtype=torch.uint8), ValueError, r"\[..., 3, 16, 16\] .* got \[2, 3, 8, 16\]"),
+        (torch.zeros(2, 16, 16, 3, dtype=torch.uint8), ValueError, "permute the channels"),
+        (torch.zeros(2, 3, 16, 16, dtype=torch.long), TypeError, "got torch.int64: convert them"),
+        (torch.zeros(2, 3, 16, 16, dtype=torch.bool), TypeError, "got torch.bool: convert them"),
+    ],
+)
+def test_other_frames_are_refused(encoder, pixels, error, message):
+    with pytest.raises(error, match=message):
+        encoder(pixels=pixels)
+
+
+def test_sizes_that_do_not_divide_are_refused():
+    with pytest.raises(ValueError, match="image_size 18 must be a multiple of 4"):
+        ConvEncoder(image_size=18, channels=(4, 8))
+    with pytest.raises(ValueError, match="image_size 20 must be a multiple of patch_size 8"):
+        ViTEncoder(image_size=20, patch_size=8)
+
+
+def test_pixels_are_normalised_as_imagenet():
+    pixels = frames(2)
+    mean, std = (torch.tensor(value).view(3, 1, 1) for value in (IMAGENET_MEAN, IMAGENET_STD))
+    normalizer = PixelNormalizer(16)
+    torch.testing.assert_close(normalizer(pixels), (pixels / 255 - mean) / std, rtol=1e-5, atol=1e-5)
+    assert not normalizer.state_dict()
+
+
+def test_the_vision_transformer_sees_patches_in_reading_order():
+    """Patch (row, column) is token row * columns + column, channels first: a convolution of stride 8."""
+    network = BUILD["vit"]().module
+    image = torch.randn(2, 3, 16, 16)
+    cut = image.unfold(2, 8, 8).unfold(3, 8, 8).permute(0, 2, 3, 1, 4, 5).flatten(3).flatten(1, 2)
+    kernel = network.to_patch.weight.unflatten(1, (3, 8, 8))
+    expected = torch.nn.functional.conv2d(image, kernel, network.to_patch.bias, stride=8).flatten(2).transpose(1, 2)
+    torch.testing.assert_close(network.to_patch(cut), expected, rtol=1e-4, atol=1e-5)

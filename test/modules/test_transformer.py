@@ -1,0 +1,92 @@
+"""Claims about attention and AdaLN-zero: the shortcuts change nothing, blocks start as the identity."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from torchrl_ficreg.modules.transformer import AdaptiveBlock, attend, Attention, Block, FeedForward
+
+
+@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize("tokens", [1, 3, 17])
+def test_attend_is_scaled_dot_product_attention(causal, tokens):
+    """In value and gradient."""
+    inputs = [torch.randn(2, 3, tokens, 8, dtype=torch.float64, requires_grad=True) for _ in range(3)]
+    ours = attend(*inputs, causal)
+    theirs = F.scaled_dot_product_attention(*inputs, is_causal=causal)
+    torch.testing.assert_close(ours, theirs)
+    gradients = (torch.autograd.grad(value, inputs, torch.ones_like(value).cumsum(-1)) for value in (ours, theirs))
+    torch.testing.assert_close(*gradients)
+
+
+def test_attend_keeps_bfloat16():
+    inputs = [torch.randn(2, 3, 5, 8) for _ in range(3)]
+    result = attend(*(value.bfloat16() for value in inputs), True)
+    assert result.dtype == torch.bfloat16
+    torch.testing.assert_close(result.float(), attend(*inputs, True), rtol=0.1, atol=0.05)
+
+
+@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize("qkv_bias", [False, True])
+def test_one_token_takes_a_shortcut_to_the_same_place(causal, qkv_bias):
+    """The first of several causal tokens sees itself alone, by the general path."""
+    attention = Attention(12, 2, 5, causal=True, qkv_bias=qkv_bias).double()
+    x = torch.randn(4, 3, 12, dtype=torch.float64)
+    expected = attention(x)[:, :1]
+    attention.causal = causal
+    torch.testing.assert_close(attention(x[:, :1]), expected)
+
+
+def test_causal_attention_does_not_look_ahead():
+    attention = Attention(8, 2, 4, causal=True, qkv_bias=True)
+    x = torch.randn(2, 5, 8)
+    before = attention(x)
+    x[:, 3:] += 1.0
+    after = attention(x)
+    assert after[:, :3].equal(before[:, :3])
+    assert not torch.isclose(after[:, 3:], before[:, 3:]).all()
+
+
+def test_a_vision_block_treats_tokens_as_a_set():
+    block, x, order = Block(8, 2, 16).double(), torch.randn(2, 5, 8, dtype=torch.float64), torch.randperm(5)
+    torch.testing.assert_close(block(x[:, order]), block(x)[:, order])
+
+
+def test_an_adaptive_block_starts_as_the_identity():
+    """AdaLN-zero: the gates are zero whatever the condition, so the tokens pass bit for bit."""
+    block, x = AdaptiveBlock(8, 2, 4, 16, dropout=0.1), torch.randn(2, 3, 8)
+    modulation = block.modulation(torch.randn(2, 3, 8))
+    assert modulation.shape == (2, 3, 48)
+    assert (modulation == 0).all()
+    assert block(x, modulation).equal(x)
+
+
+def test_the_modulation_of_a_layer_learns_from_the_first_step():
+    """Zeroed, but not dead: gradient reaches the gates at once."""
+    block, x = AdaptiveBlock(8, 2, 4, 16, dropout=0.0), torch.randn(2, 3, 8)
+    block(x, block.modulation(torch.randn(2, 3, 8))).square().sum().backward()
+    gate = block.to_modulation.weight.grad.unflatten(0, (6, 8)).flatten(1).norm(dim=1)
+    assert gate[2] > 0
+    assert gate[5] > 0
+
+
+def test_shift_scale_and_gate_are_those_of_the_paper():
+    """Each branch is x + gate * branch(norm(x) * (1 + scale) + shift), written out."""
+    block = AdaptiveBlock(8, 2, 4, 16, dropout=0.0).double()
+    x, modulation = torch.randn(2, 3, 8).double(), torch.randn(2, 3, 48).double()
+    shift, scale, gate, shift_mlp, scale_mlp, gate_mlp = modulation.split(8, -1)
+
+    def norm(y):
+        return (y - y.mean(-1, keepdim=True)) / (y.var(-1, keepdim=True, correction=0) + 1e-6).sqrt()
+
+    expected = x + gate * block.attn(block.attn_norm(norm(x) * (1 + scale) + shift))
+    expected = expected + gate_mlp * block.mlp(block.mlp_norm(norm(expected) * (1 + scale_mlp) + shift_mlp))
+    torch.testing.assert_close(block(x, modulation), expected)
+
+
+def test_the_feed_forward_layer_uses_the_exact_gelu():
+    layer, x = FeedForward(4, 8).double(), torch.randn(3, 4).double()
+    hidden = layer[0](x)
+    torch.testing.assert_close(layer(x), layer[3](hidden * 0.5 * (1 + torch.erf(hidden / 2**0.5))))

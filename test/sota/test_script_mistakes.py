@@ -1,0 +1,133 @@
+"""A user's mistake ends in one line that says what to do, an exit code other than zero, and nothing on disk."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from conftest import SCRIPTS
+from torchrl.checkpoint import Checkpoint
+
+from torchrl_ficreg.trainers import find_checkpoint, load_world_model
+
+RUN = "runs/two_room_cpu_ficreg_seed0"
+
+
+@pytest.fixture
+def check(monkeypatch):
+    """The check that runs before Hydra, called in this process: importing torch for every misspelling is slow."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    import cli
+
+    yield cli.check_overrides
+    sys.modules.pop("cli", None)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("optim.lrr=1", "no field 'optim.lrr' to change; did you mean 'optim.lr'?"),
+        ("optm.lr=1", "did you mean 'optim.lr'?"),
+        ("+new=1", "no field 'new'"),
+        ("++new=1", "no field 'new'"),
+        ("+optim.new=1", "no field 'optim.new'"),
+        ("~optim.lr", "no field 'optim.lr' to change"),
+        ("optim.lr.deeper=1", "no field 'optim.lr.deeper'"),
+        ("method=leWM", "method=leWM is unknown: choose one of ['ficreg', 'lewm']"),
+        ("env=three_room", "env=three_room is unknown"),
+        ("optim.epochs=many", "expected a value like"),
+        ("optim.epochs=1.5", "expected a value like"),
+        ("optim.epochs=true", "expected a value like"),
+        ("optim.lr=[1,2]", "expected a value like 0.0"),
+        ("optim.lr=true", "expected a value like"),
+        ("model.conv_channels=3", "expected a value like"),
+        ("name=[a]", "expected a value like"),
+        ("optim=3", "expected a value like"),
+        ("seed=null", "expected a value like 0, got None"),
+    ],
+)
+def test_unknown_fields_and_values_of_another_kind_are_refused(check, override, message):
+    with pytest.raises(ValueError) as caught:
+        check("train", [override])
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["optim.lr=1", "optim.epochs=2", "method=lewm"],
+        ["model=paper", "model.history=1", "model.conv_channels=[4,8]"],
+        ["name=x-1", "name=3", "device=cuda:1"],
+        ["hydra.run.dir=elsewhere"],
+        ["seed=0,1,2", "method=ficreg,lewm"],
+        ["env.kwargs.collision=endpoint"],
+    ],
+)
+def test_what_the_files_declare_may_be_changed(check, overrides):
+    assert check("train", overrides) is None
+
+
+def refused(done, *words):
+    assert done.returncode != 0
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: "), done.stderr
+    assert all(word in lines[0] for word in words), lines[0]
+    assert not done.stdout
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["optim.lrr=1"], ["did you mean 'optim.lr'"]),
+        (["optim.epochs=0", "optim.lr=-1.0"], ["must be positive", "optim.epochs=0", "optim.lr=-1.0"]),
+        (["seed=-1"], ["must not be negative", "seed=-1"]),
+        (["optim.warmup=2.0"], ["optim.warmup must lie in [0, 1)"]),
+        (["env.kwargs.collision=soft"], ["collision must be one of"]),
+        (["plan.num_elites=50"], ["num_elites must lie between 2 and num_candidates=20"]),
+    ],
+)
+def test_a_mistake_is_found_before_anything_is_written(execute, tmp_path, overrides, words):
+    refused(execute(tmp_path, "train.py", *overrides), *words)
+    assert not list(tmp_path.iterdir())
+
+
+def test_another_configuration_under_the_same_name_is_refused(trained, execute, files):
+    before = files(trained)
+    done = execute(trained, "train.py", f"name={RUN.split('/')[1]}", "optim.lr=0.1", "loss.idm_coeff=7.0")
+    refused(done, "another configuration", "optim.lr: 0.0005 -> 0.1", "loss.idm_coeff", "give another name=")
+    assert files(trained) == before
+
+
+def test_a_name_is_not_lost_to_a_configuration_that_never_trained(trained, execute, tmp_path):
+    """A batch larger than the data is found only after the run folder was made; the mended command may use the name."""
+    (tmp_path / "data").symlink_to(trained / "data")
+    refused(execute(tmp_path, "train.py", "name=mine", "optim.batch_size=100000"), "less than one batch")
+    done = execute(tmp_path, "train.py", "name=mine", "env.goal_offset=1")
+    assert done.returncode == 0, done.stderr  # and with all pairs solved at the start, there is a report all the same
+    assert "-" in done.stdout.splitlines()[2].split()
+
+
+def test_too_few_episodes_for_the_pairs_are_found_before_training(trained, execute, tmp_path):
+    (tmp_path / "data").symlink_to(trained / "data")
+    refused(execute(tmp_path, "train.py", "evaluation.num_pairs=9999"), "cannot draw 9999 pairs", "Collect more episodes")
+    assert not list(tmp_path.rglob("metrics.csv"))
+
+
+def test_evaluate_names_what_is_missing(trained, execute, files):
+    before = files(trained)
+    refused(execute(trained, "evaluate.py"), "name the model to evaluate: checkpoint=runs/")
+    refused(execute(trained, "evaluate.py", "checkpoint=runs/nowhere"), "no checkpoint at runs/nowhere")
+    assert files(trained) == before
+
+
+def test_a_model_whose_actions_cannot_come_from_the_environment_is_refused(trained, execute, tmp_path):
+    """Its statistics say mean 40 where the environment's bounds are -1 and 1."""
+    path = find_checkpoint(trained / RUN)
+    model, inverse_model, _ = load_world_model(path)
+    model.action_mean.fill_(40.0)
+    card = Checkpoint(card={}).load(path, components=["card"]).values["card"]
+    wrong = tmp_path / "wrong.torchrl"
+    Checkpoint(card=card, world_model=model, inverse_model=inverse_model).save(wrong, format="archive")
+    done = execute(tmp_path, "evaluate.py", "checkpoint=wrong.torchrl", f"pairs={trained / RUN / 'pairs.json'}")
+    refused(done, "action statistics", "was the model trained for another environment?")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["wrong.torchrl"]

@@ -1,0 +1,150 @@
+"""train.py from an empty folder to a report: what it leaves, that it repeats, and that it never trains twice."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import time
+
+import imageio.v3 as imageio
+import pytest
+import torch
+
+from torchrl_ficreg.data import OfflineTrajectories
+from torchrl_ficreg.trainers import load_world_model
+
+RUN = "runs/two_room_cpu_ficreg_seed0"
+DATA = "data/two_room_32px_seed0"
+
+
+def weights(folder):
+    model, inverse_model, _ = load_world_model(folder)
+    return {**model.state_dict(), **{f"inverse {name}": value for name, value in inverse_model.state_dict().items()}}
+
+
+def outcomes(folder):
+    results = json.loads((folder / "results.json").read_text())
+    return {name: {k: v for k, v in row.items() if k != "seconds_per_plan"} for name, row in results.items() if "pairs" in row}
+
+
+def test_a_run_leaves_exactly_the_documented_files(trained, files):
+    """A run folder, a dataset, and no litter: no outputs/, no log, no half-written file."""
+    run = {name for name in files(trained / RUN)}
+    (checkpoint,) = {name for name in run if name.startswith("checkpoints/")}
+    assert run - {checkpoint} == {
+        "config.yaml",
+        "episodes.gif",
+        "latent_distance.png",
+        "learning_curve.png",
+        "metrics.csv",
+        "pairs.json",
+        "results.json",
+    }
+    assert {name.split("/")[0] for name in files(trained)} == {"data", "runs"}
+    assert {name for name in files(trained / DATA)} == {
+        "action.memmap",
+        "episodes.jsonl",
+        "meta.json",
+        "pairs_4x25_seed0.json",
+        "pixels.memmap",
+        "state.memmap",
+    }
+
+
+def test_the_results_say_what_was_measured(trained):
+    results = json.loads((trained / RUN / "results.json").read_text())
+    assert set(results) == {"ficreg", "random", "latent_distance", "training", "versions"}
+    for name in ("ficreg", "random"):
+        assert results[name]["pairs"] == 4 and results[name]["budget"] == 50
+        assert 0 <= results[name]["success_rate"] <= 1
+    assert results["ficreg"]["pairs_hash"] == results["random"]["pairs_hash"]
+    assert results["ficreg"]["seconds_per_plan"] > 0 == results["random"]["seconds_per_plan"]
+    data = OfflineTrajectories(trained / DATA, split="train", num_frames=2, frame_skip=5, batch_size=32)
+    assert results["training"]["steps"] == data.batches_per_epoch
+    assert results["training"]["dataset_fingerprint"] == data.fingerprint
+    assert str(trained) not in json.dumps(results)
+
+
+def test_the_pictures_open(trained):
+    for name in ("learning_curve.png", "latent_distance.png"):
+        assert imageio.imread(trained / RUN / name).std() > 5
+    assert imageio.imread(trained / RUN / "episodes.gif").ndim == 4
+
+
+def test_the_same_command_elsewhere_gives_the_same_weights_and_outcomes(trained, execute, tmp_path):
+    """This time the episodes come from two worker processes; three pairs at a time are evaluated."""
+    done = execute(tmp_path, "train.py", "collect.num_workers=2", "evaluation.num_envs=3")
+    assert done.returncode == 0, done.stderr
+    first, second = weights(trained / RUN), weights(tmp_path / RUN)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert outcomes(trained / RUN) == outcomes(tmp_path / RUN)
+
+
+def test_evaluate_repeats_the_outcome_bit_for_bit(trained, execute, files):
+    """Same plan settings, another number of environments; the run's own files stay as they are."""
+    before = files(trained)
+    plan = ["plan.iterations=1", "plan.num_candidates=20", "plan.num_elites=5"]
+    done = execute(trained, "evaluate.py", f"checkpoint={RUN}", "num_envs=3", "record=1", *plan)
+    assert done.returncode == 0, done.stderr
+    repeated = json.loads((trained / RUN / "evaluation" / "results.json").read_text())
+    for key, value in outcomes(trained / RUN)["ficreg"].items():
+        assert repeated[key] == value, key
+    after = files(trained)
+    new = {name for name in after if name not in before}
+    assert new == {f"{RUN}/evaluation/results.json", f"{RUN}/evaluation/episodes.gif"}
+    assert all(after[name] == before[name] for name in before)
+
+
+def test_a_finished_command_given_again_trains_nothing(trained, execute, files):
+    before = files(trained / RUN)
+    done = execute(trained, "train.py", "evaluation.num_pairs=3")  # evaluation settings may change
+    assert done.returncode == 0, done.stderr
+    assert "train:" not in done.stderr and "collect:" not in done.stderr
+    after = files(trained / RUN)
+    unchanged = [name for name in before if name.startswith("checkpoints/") or name == "metrics.csv"]
+    assert len(unchanged) == 2 and all(after[name] == before[name] for name in unchanged)
+    results = json.loads(after["results.json"])
+    assert results["ficreg"]["pairs"] == 3
+    assert results["training"]["resumed_at_step"] == results["training"]["steps"]
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_run_stopped_while_collecting_records_the_same_bytes_when_repeated(
+    trained, command, environment, execute, tmp_path, stop, files
+):
+    """Stopped after the first committed episodes, in the middle of recording; nothing else is running any more."""
+    line = command("collect.py", "collect.num_workers=1")
+    process = subprocess.Popen(line, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
+    index = tmp_path / DATA / "episodes.jsonl"
+    while process.poll() is None and not (index.exists() and index.read_bytes().count(b"\n") >= 2):
+        time.sleep(0.001)
+    process.send_signal(stop)
+    _, err = process.communicate(timeout=60)
+    assert index.read_bytes().count(b"\n") < 20, "the recording was over too soon"
+    assert process.returncode != 0
+    if stop == signal.SIGINT:
+        assert err.strip().endswith("interrupted: the same command continues from the last checkpoint.")
+        assert "Traceback" not in err
+    done = execute(tmp_path, "collect.py")
+    assert done.returncode == 0, done.stderr
+    assert "20 episodes" in done.stdout
+    recorded, expected = files(tmp_path / DATA), files(trained / DATA)
+    assert recorded == {name: expected[name] for name in recorded}
+    assert len(recorded) == 5
+
+
+@pytest.mark.parametrize("backend", ["tensorboard", "wandb"])
+def test_lewm_trains_and_other_loggers_work(trained, execute, tmp_path, backend):
+    """The baseline has its own run folder on the same data and no term of FICReg; its logger's files are inside it."""
+    pytest.importorskip(backend)
+    (tmp_path / "data").symlink_to(trained / "data")
+    done = execute(tmp_path, "train.py", "method=lewm", f"logger.backend={backend}", "logger.interval=5")
+    assert done.returncode == 0, done.stderr
+    run_dir = tmp_path / "runs" / "two_room_cpu_lewm_seed0"
+    header = (run_dir / "metrics.csv").read_text().splitlines()[0]
+    assert "loss_pred" in header and "loss_idm" not in header and "loss_consistency" not in header
+    assert "lewm" in json.loads((run_dir / "results.json").read_text())
+    pattern = "events.out.*" if backend == "tensorboard" else "run-*.wandb"
+    assert list((run_dir / backend).rglob(pattern))
+    assert {path.name for path in tmp_path.iterdir()} == {"data", "runs"}

@@ -1,0 +1,126 @@
+"""Claims about the package as a whole: light to import, one-way imports, runnable examples, no loose ends."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import importlib
+import inspect
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torchrl_ficreg
+
+ROOT = Path(torchrl_ficreg.__file__).parent
+FILES = sorted(ROOT.rglob("*.py"))
+TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in FILES}
+MODULES = [info.name for info in pkgutil.walk_packages([str(ROOT)], "torchrl_ficreg.")]
+PACKAGES = ["torchrl_ficreg", *(f"torchrl_ficreg.{part}" for part in ("data", "envs", "modules", "objectives"))]
+PACKAGES += ["torchrl_ficreg.trainers", "torchrl_ficreg.evaluation"]
+
+# Who may import whom, inside the package. Nobody else, and never the other way round.
+BELOW = {
+    "data": set(),
+    "envs": {"data"},  # of it the schema alone, see below
+    "modules": {"data"},
+    "objectives": {"data", "modules"},
+    "trainers": {"data", "modules", "objectives"},
+    "evaluation": {"data", "modules", "objectives", "trainers", "envs"},
+}
+HEAVY = "pymunk mujoco dm_control ogbench h5py wandb matplotlib imageio pygame transformers".split()
+
+
+def imports(tree: ast.AST) -> list[str]:
+    """Dotted names that a file imports, from inside functions too."""
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names += [f"{'.' * node.level}{node.module or ''}.{alias.name}" for alias in node.names]
+    return names
+
+
+def calls(tree: ast.AST) -> list[ast.Call]:
+    return [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+
+
+def test_importing_the_losses_loads_no_simulator_and_no_plotting():
+    code = f"import sys; from torchrl_ficreg import FICRegLoss; print([n for n in {HEAVY} if n in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]", result.stdout
+
+
+@pytest.mark.parametrize("path", TREES)
+def test_imports_only_go_down(path):
+    part = path.split("/")[0]
+    for name in imports(TREES[path]):
+        assert not name.startswith("."), f"{path}: write the full name instead of {name}"
+        if not name.startswith("torchrl_ficreg") or part not in BELOW:
+            continue
+        target = name.split(".")[1] if "." in name else ""
+        assert target == part or target in BELOW[part], f"{path} imports {name}"
+        if part == "envs" and target == "data":
+            assert name.startswith("torchrl_ficreg.data.schema."), f"{path} imports {name}: only the schema is shared"
+
+
+def test_every_part_is_on_the_street():
+    assert {path.name for path in ROOT.iterdir() if path.is_dir() and path.name != "__pycache__"} == set(BELOW)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_the_examples_in_docstrings_run(name):
+    failed, _ = doctest.testmod(importlib.import_module(name))
+    assert failed == 0
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_public_names_exist_and_are_explained(package):
+    module = importlib.import_module(package)
+    assert module.__doc__
+    for name in getattr(module, "__all__", []):
+        value = getattr(module, name)
+        if inspect.isclass(value) or inspect.isroutine(value):
+            assert value.__dict__.get("__doc__") if inspect.isclass(value) else value.__doc__, name
+
+
+@pytest.mark.parametrize("path", TREES)
+def test_public_classes_functions_and_methods_are_explained(path):
+    def undocumented(node, prefix=""):
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, (ast.ClassDef, ast.FunctionDef)) and not child.name.startswith("_"):
+                setter = any(getattr(mark, "attr", None) == "setter" for mark in child.decorator_list)
+                if ast.get_docstring(child) is None and not setter:
+                    yield f"{prefix}{child.name}"
+                if isinstance(child, ast.ClassDef):
+                    yield from undocumented(child, f"{prefix}{child.name}.")
+
+    assert ast.get_docstring(TREES[path]), f"{path} does not say what it is for"
+    assert list(undocumented(TREES[path])) == []
+
+
+@pytest.mark.parametrize("path", TREES)
+def test_the_package_neither_prints_nor_asserts(path):
+    assert not [node.lineno for node in ast.walk(TREES[path]) if isinstance(node, ast.Assert)]
+    assert not [call.lineno for call in calls(TREES[path]) if getattr(call.func, "id", None) == "print"]
+
+
+@pytest.mark.parametrize("path", TREES)
+def test_networks_borrow_weights_without_copying_them(path):
+    """tensordict's default would turn every frozen weight into a fresh trainable one."""
+    for call in calls(TREES[path]):
+        if isinstance(call.func, ast.Attribute) and call.func.attr == "to_module":
+            keyword = {word.arg: word.value for word in call.keywords}.get("preserve_module_state")
+            assert isinstance(keyword, ast.Constant), f"{path}:{call.lineno}"
+            assert keyword.value is False, f"{path}:{call.lineno}"
+
+
+@pytest.mark.parametrize("path", TREES)
+def test_annotations_are_lazy(path):
+    """``from __future__ import annotations`` on top of every file that annotates anything."""
+    annotated = [node for node in ast.walk(TREES[path]) if isinstance(node, (ast.FunctionDef, ast.AnnAssign))]
+    assert not annotated or "__future__.annotations" in imports(TREES[path])

@@ -73,14 +73,13 @@ def collect_dataset(cfg: DictConfig) -> Path:
             expert_kwargs=OmegaConf.to_container(data.expert),
             env_kwargs=OmegaConf.to_container(cfg.env.kwargs),
         )
-        bar = tqdm(total=data.episodes, initial=writer.num_episodes, desc="collect", unit="episode", dynamic_ncols=True)
-        first_step = writer.num_steps
-        for episode in episodes:
-            writer.append(episode)
-            bar.update()
-            elapsed = bar.format_dict["elapsed"]
-            bar.set_postfix_str(f"{(writer.num_steps - first_step) / max(elapsed, 1e-9):.0f} frames/s", refresh=False)
-        bar.close()
+        first_step, done = writer.num_steps, writer.num_episodes
+        with tqdm(total=data.episodes, initial=done, desc="collect", unit="episode", dynamic_ncols=True) as bar:
+            for episode in episodes:
+                writer.append(episode)
+                bar.update()
+                rate = (writer.num_steps - first_step) / max(bar.format_dict["elapsed"], 1e-9)
+                bar.set_postfix_str(f"{rate:.0f} frames/s", refresh=False)
     return path
 
 
@@ -125,7 +124,9 @@ def make_logger(cfg: DictConfig, run_dir: Path) -> Logger | None:
     except ImportError as error:
         package = "'torchrl_ficreg[wandb]'" if backend == "wandb" else "tensorboard"
         raise ImportError(f"logger.backend={backend} needs a package: pip install {package}.") from error
-    logger.log_hparams(OmegaConf.to_container(cfg, resolve=True))
+    settings = _flat(OmegaConf.to_container(cfg, resolve=True))
+    plain = (int, float, str, bool)  # all that tensorboard takes
+    logger.log_hparams({key: value if isinstance(value, plain) else str(value) for key, value in settings.items()})
     return logger
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -65,10 +66,22 @@ def files() -> Callable[[Path], dict[str, bytes]]:
 
 
 @pytest.fixture(scope="session")
-def trained(tmp_path_factory, execute) -> Path:
-    """A folder in which train.py ran once with its defaults made tiny."""
+def trained_once(tmp_path_factory, execute, files) -> tuple[Path, set[str]]:
+    """A folder in which train.py ran once with its defaults made tiny, and what it held right afterwards."""
     folder = tmp_path_factory.mktemp("trained")
     done = execute(folder, "train.py")
     assert done.returncode == 0, done.stderr
     assert "ficreg" in done.stdout and "random" in done.stdout
-    return folder
+    return folder, set(files(folder))
+
+
+@pytest.fixture(scope="session")
+def trained(trained_once) -> Path:
+    """The folder of the trained run, to be read only."""
+    return trained_once[0]
+
+
+@pytest.fixture
+def copy(trained, tmp_path) -> Path:
+    """A copy of it, to be changed."""
+    return Path(shutil.copytree(trained, tmp_path / "copy"))

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
+from pathlib import Path
 
+import hydra
 import pytest
-from conftest import SCRIPTS
 from torchrl.checkpoint import Checkpoint
 
 from torchrl_ficreg.trainers import find_checkpoint, load_world_model
 
 RUN = "runs/two_room_cpu_ficreg_seed0"
+SCRIPTS = Path(__file__).resolve().parents[2] / "sota-implementations" / "ficreg"
 
 
 @pytest.fixture
-def check(monkeypatch):
-    """The check that runs before Hydra, called in this process: importing torch for every misspelling is slow."""
+def scripts(monkeypatch):
+    """Imports a module of the scripts into this process: a new one for every misspelling would be slow."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
-    import cli
+    yield importlib.import_module
+    for name in ("cli", "utils"):
+        sys.modules.pop(name, None)
 
-    yield cli.check_overrides
-    sys.modules.pop("cli", None)
+
+@pytest.fixture
+def check(scripts):
+    """The check that runs before Hydra."""
+    return scripts("cli").check_overrides
 
 
 @pytest.mark.parametrize(
@@ -76,18 +84,36 @@ def refused(done, *words):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "words"),
+    ("overrides", "message"),
     [
-        (["optim.lrr=1"], ["did you mean 'optim.lr'"]),
-        (["optim.epochs=0", "optim.lr=-1.0"], ["must be positive", "optim.epochs=0", "optim.lr=-1.0"]),
-        (["seed=-1"], ["must not be negative", "seed=-1"]),
-        (["optim.warmup=2.0"], ["optim.warmup must lie in [0, 1)"]),
-        (["env.kwargs.collision=soft"], ["collision must be one of"]),
-        (["plan.num_elites=50"], ["num_elites must lie between 2 and num_candidates=20"]),
+        (["optim.epochs=0", "optim.lr=-1.0"], "must be positive: optim.epochs=0, optim.lr=-1.0"),
+        (["env.data.max_steps=0"], "must be positive: env.data.max_steps=0"),
+        (["seed=-1"], "must not be negative: seed=-1"),
+        (["collect.num_workers=-1"], "must not be negative: collect.num_workers=-1"),
+        (["optim.warmup=2.0"], r"optim.warmup must lie in \[0, 1\)"),
+        (["optim.precision=fp16"], "unknown precision 'fp16'"),
+        (["env.kwargs.collision=soft"], "collision must be one of"),
+        (["plan.num_elites=500"], "num_elites must lie between 2 and num_candidates=300"),
+        (["plan.bounds=wide"], "unknown bounds 'wide'"),
+        (["method.context=dead"], "unknown method.context 'dead'"),
+        (["logger.backend=paper"], "unknown logger.backend 'paper'"),
+        (["device=quantum"], "device=quantum cannot be used here"),
+        (["model.encoder=mlp"], "unknown encoder 'mlp'"),
     ],
 )
-def test_a_mistake_is_found_before_anything_is_written(execute, tmp_path, overrides, words):
-    refused(execute(tmp_path, "train.py", *overrides), *words)
+def test_settings_out_of_range_are_found_before_anything_is_written(scripts, overrides, message):
+    with hydra.initialize_config_dir(str(SCRIPTS / "config"), version_base="1.3"):
+        settings = hydra.compose("train", overrides)
+    with pytest.raises(ValueError, match=message):
+        scripts("utils").check_settings(settings)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [("optim.lrr=1", ["did you mean 'optim.lr'"]), ("optim.epochs=0", ["must be positive", "optim.epochs=0"])],
+)
+def test_a_mistake_is_one_line_and_writes_nothing(execute, tmp_path, override, words):
+    refused(execute(tmp_path, "train.py", override), *words)
     assert not list(tmp_path.iterdir())
 
 

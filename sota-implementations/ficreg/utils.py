@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import platform
@@ -42,7 +43,8 @@ def get_device(name: str) -> torch.device:
 
 def dataset_path(cfg: DictConfig) -> Path:
     """Where the dataset of a configuration lives."""
-    return Path(cfg.data_dir) / f"{cfg.env.name}_{cfg.model.image_size}px_seed{cfg.env.data.seed}"
+    data = cfg.env.data
+    return Path(cfg.data_dir) / f"{cfg.env.name}_{cfg.model.image_size}px_{data.episodes}episodes_seed{data.seed}"
 
 
 def collect_dataset(cfg: DictConfig) -> Path:
@@ -203,6 +205,7 @@ def claim_run_dir(cfg: DictConfig) -> Path:
 
     Raises:
         ValueError: it holds a run of another configuration.
+        RuntimeError: another process is at work in it.
     """
     run_dir, ours = Path(cfg.runs_dir) / cfg.name, OmegaConf.to_container(cfg, resolve=True)
     path = run_dir / "config.yaml"
@@ -214,6 +217,10 @@ def claim_run_dir(cfg: DictConfig) -> Path:
             what = ", ".join(f"{key}: {_flat(theirs).get(key)} -> {_flat(ours).get(key)}" for key in differ[:3])
             raise ValueError(f"{run_dir} holds a run of another configuration ({what}): give another name=...")
     run_dir.mkdir(parents=True, exist_ok=True)
+    try:  # held, on the folder itself, until this process ends
+        fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise RuntimeError(f"another process is at work in {run_dir}: wait for it, or give another name=...") from error
     write_text(path, OmegaConf.to_yaml(OmegaConf.create(ours)))
     return run_dir
 

@@ -15,7 +15,7 @@ from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.trainers import load_world_model
 
 RUN = "runs/two_room_cpu_ficreg_seed0"
-DATA = "data/two_room_32px_seed0"
+DATA = "data/two_room_32px_20episodes_seed0"
 
 
 def weights(folder):

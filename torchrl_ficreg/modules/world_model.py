@@ -74,11 +74,11 @@ class LatentWorldModel(TensorDictModuleBase):
 
     def encode(self, pixels: torch.Tensor) -> torch.Tensor:
         """Frames [..., 3, H, W], uint8 or floats in 0..1 -> latents [..., D]."""
-        return self.encoder.module(pixels)
+        return _by_keys(self.encoder, pixels)
 
     def predict(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Latents [..., T, D] and the z-scored action blocks leading on [..., T, F * A] -> next latents [..., T, D]."""
-        return self.predictor.module(latent, action)
+        return _by_keys(self.predictor, latent, action)
 
     def rollout(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Imagines where a sequence of action blocks leads, feeding predictions back.
@@ -130,3 +130,9 @@ class LatentWorldModel(TensorDictModuleBase):
         latent = self.encode(tensordict.get(PIXELS))
         predicted = self.predict(latent[..., :-1, :], tensordict.get(ACTION)[..., :-1, :])
         return TensorDict({LATENT: latent, PREDICTED_LATENT: predicted}, latent.shape[:-2])
+
+
+def _by_keys(module: TensorDictModuleBase, *inputs: torch.Tensor) -> torch.Tensor:
+    """Calls a TensorDictModule on tensors, whatever its keys are called; its last output."""
+    tensordict = TensorDict(dict(zip(module.in_keys, inputs)))
+    return module(tensordict).get(module.out_keys[-1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,8 @@ class OfflineTrainer(Trainer):
         self.steps_per_epoch = replay_buffer.batches_per_epoch
         if self.steps_per_epoch * replay_buffer.batch_size > len(replay_buffer):
             raise ValueError("the last batch of an epoch is incomplete: make the training buffer with drop_last=True.")
+        if getattr(loss_module, "reduction", "mean") == "none":
+            raise ValueError("a loss with reduction='none' has no single number to descend: build it with 'mean'.")
         self.total_steps = epochs * self.steps_per_epoch
         frames = replay_buffer.batch_size * replay_buffer.num_frames  # of one step
         params = [p for p in loss_module.parameters() if p.requires_grad]
@@ -107,8 +110,10 @@ class OfflineTrainer(Trainer):
             checkpoint=None if run_dir is None else Checkpoint(format="archive", rng=GlobalRNGState(), **(components or {})),
             checkpoint_rotation=rotation,
         )
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, WarmupCosine(self.total_steps, warmup))
-        LRSchedulerHook(schedule, interval="optim").register(self)
+        self.schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, WarmupCosine(self.total_steps, warmup))
+        LRSchedulerHook(self.schedule, interval="optim").register(self)
+        self.clock = Clock()
+        self.register_module("clock", self.clock)
         metrics = None if run_dir is None else Path(run_dir) / METRICS
         self.metrics_table = MetricsTable(metrics, log_interval, self.total_steps)
         self.metrics_table.register(self)
@@ -138,6 +143,12 @@ class OfflineTrainer(Trainer):
                     f"{latest} cannot be continued ({error}): repeat the settings it was made with, or, if it is "
                     "damaged, move it away to continue from the one before."
                 ) from error
+            planned = self.schedule.lr_lambdas[0].steps
+            if planned != self.total_steps:
+                raise ValueError(
+                    f"{latest} was scheduled for {planned} steps, not {self.total_steps}: the learning rate has fallen "
+                    "accordingly. Repeat its epochs and batch size, or begin another run."
+                )
             _align(self.optimizer)
         self._sweep()
         self.metrics_table.drop_after(self.step)
@@ -154,7 +165,9 @@ class OfflineTrainer(Trainer):
     def train(self) -> None:
         """Runs to the end, or not at all when the resumed run had reached it."""
         if self.step < self.total_steps:
+            self.clock.start()
             super().train()
+            self.clock.stop()
 
 
 def _align(optimizer: torch.optim.Optimizer) -> None:
@@ -167,6 +180,34 @@ def _align(optimizer: torch.optim.Optimizer) -> None:
         for key, value in state.items():
             if torch.is_tensor(value) and value.shape == parameter.shape:
                 state[key] = torch.empty_like(parameter, requires_grad=False).copy_(value)
+
+
+class Clock:
+    """Wall time spent in training, over all lives of a run."""
+
+    def __init__(self) -> None:
+        self._before, self._began = 0.0, None
+
+    @property
+    def seconds(self) -> float:
+        """Seconds so far."""
+        return self._before + (time.perf_counter() - self._began if self._began is not None else 0.0)
+
+    def start(self) -> None:
+        """Begins to count."""
+        self._began = time.perf_counter()
+
+    def stop(self) -> None:
+        """Ceases to count."""
+        self._before, self._began = self.seconds, None
+
+    def state_dict(self) -> dict[str, float]:
+        """The seconds so far."""
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Continues from there."""
+        self._before = float(state_dict["seconds"])
 
 
 class WarmupCosine:

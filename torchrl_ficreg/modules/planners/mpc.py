@@ -16,7 +16,9 @@ class MPCPolicy(TensorDictModuleBase):
 
     Its memory travels in the tensordict, under ``"mpc"``: the raw actions still to be executed, how many were, how
     often was planned, and the cost predicted for the plan in force. Environments are independent: those that are fresh
-    (no memory yet, or ``is_init`` true) or whose queue is used up are planned for, the others are left alone.
+    (no memory yet, or ``is_init`` true) or whose queue is used up are planned for, the others are left alone. Where
+    environments reset themselves, append TorchRL's ``InitTracker``, which writes ``is_init``: without it the old
+    episode's actions go on.
     ``plan_seed`` [E] int64 names each environment's random draws (0, 1, ... when absent), so a plan depends neither on
     who else is planned for nor on when.
 

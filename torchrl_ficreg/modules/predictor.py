@@ -97,10 +97,15 @@ class CausalTransformer(nn.Module):
         self.history, self.latent_dim, self.action_dim = history, latent_dim, action_dim
         self.action_embedding = ActionEmbedding(action_dim, width, action_bottleneck)
         self.to_width = nn.Identity() if latent_dim == width else nn.Linear(latent_dim, width)
-        self.position = nn.Parameter(0.02 * torch.randn(1, history, width))
+        self.position = nn.Parameter(torch.empty(1, history, width))
         self.blocks = nn.ModuleList(AdaptiveBlock(width, heads, dim_head, mlp_dim, dropout) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
         self.projector = Projector(width, projector_dim, latent_dim)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Draws the position embedding; the layers reset themselves."""
+        nn.init.normal_(self.position, std=0.02)
 
     def modulation(self, action: torch.Tensor) -> torch.Tensor:
         """Action blocks [..., T, F * A] -> modulation of every layer [depth, ..., T, 6 * width].

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+from torchrl_ficreg.modules.batch_norm import GlobalBatchNorm1d
+
 
 class Projector(nn.Module):
     """Linear, BatchNorm, GELU, linear: frees the latent from the scale that a LayerNorm fixes (arXiv 2603.19312).
@@ -19,7 +21,7 @@ class Projector(nn.Module):
     def __init__(self, in_dim: int, hidden_dim: int, out_dim: int) -> None:
         super().__init__()
         self.layer_in = nn.Linear(in_dim, hidden_dim)
-        self.norm = nn.BatchNorm1d(hidden_dim)
+        self.norm = GlobalBatchNorm1d(hidden_dim)
         self.layer_out = nn.Linear(hidden_dim, out_dim)
         self.activation = nn.GELU()
 

@@ -77,12 +77,12 @@ class FeedForward(nn.Sequential):
 
 
 class Block(nn.Module):
-    """Pre-norm transformer block, [N, T, C] -> [N, T, C]."""
+    """Pre-norm transformer block, [N, T, C] -> [N, T, C]; causal if asked to be."""
 
-    def __init__(self, dim: int, heads: int, mlp_dim: int, eps: float = 1e-12) -> None:
+    def __init__(self, dim: int, heads: int, mlp_dim: int, eps: float = 1e-12, *, causal: bool = False) -> None:
         super().__init__()
         self.attn_norm = nn.LayerNorm(dim, eps=eps)
-        self.attn = Attention(dim, heads, dim // heads, causal=False, qkv_bias=True)
+        self.attn = Attention(dim, heads, dim // heads, causal=causal, qkv_bias=True)
         self.mlp_norm = nn.LayerNorm(dim, eps=eps)
         self.mlp = FeedForward(dim, mlp_dim)
 
@@ -103,12 +103,16 @@ class AdaptiveBlock(nn.Module):
         super().__init__()
         self.adaptive_norm = nn.LayerNorm(dim, eps=1e-6, elementwise_affine=False)
         self.to_modulation = nn.Linear(dim, 6 * dim)
-        nn.init.zeros_(self.to_modulation.weight)
-        nn.init.zeros_(self.to_modulation.bias)
         self.attn_norm = nn.LayerNorm(dim)
         self.attn = Attention(dim, heads, dim_head, causal=True, qkv_bias=False, dropout=dropout)
         self.mlp_norm = nn.LayerNorm(dim)
         self.mlp = FeedForward(dim, mlp_dim, dropout)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Zeroes the modulation; the other layers reset themselves."""
+        nn.init.zeros_(self.to_modulation.weight)
+        nn.init.zeros_(self.to_modulation.bias)
 
     def modulation(self, condition: torch.Tensor) -> torch.Tensor:
         """Condition [N, T, C] -> shift, scale and gate of both branches [N, T, 6C]."""

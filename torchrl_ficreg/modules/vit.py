@@ -42,11 +42,17 @@ class VisionTransformer(nn.Module):
         num_patches = (image_size // patch_size) ** 2
         self.normalize = PixelNormalizer(image_size)
         self.to_patch = nn.Linear(3 * patch_size**2, width)
-        self.class_token = nn.Parameter(0.02 * torch.randn(1, 1, width))
-        self.position = nn.Parameter(0.02 * torch.randn(1, num_patches + 1, width))
+        self.class_token = nn.Parameter(torch.empty(1, 1, width))
+        self.position = nn.Parameter(torch.empty(1, num_patches + 1, width))
         self.blocks = nn.ModuleList(Block(width, heads, mlp_dim) for _ in range(depth))
         self.norm = nn.LayerNorm(width, eps=1e-12)
         self.projector = Projector(width, projector_dim, latent_dim)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Draws the class token and the position embedding; the layers reset themselves."""
+        nn.init.normal_(self.class_token, std=0.02)
+        nn.init.normal_(self.position, std=0.02)
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         """[..., 3, H, W] -> [..., D]."""

@@ -2,7 +2,23 @@
 
 from torchrl_ficreg.objectives.ficreg import FICRegLoss
 from torchrl_ficreg.objectives.flow import gradient_flow
+from torchrl_ficreg.objectives.health import latent_health, LatentHealth
+from torchrl_ficreg.objectives.joint_inverse import JointInverseLoss
 from torchrl_ficreg.objectives.lewm import LeWMLoss
+from torchrl_ficreg.objectives.pldm import PLDMLoss
 from torchrl_ficreg.objectives.sigreg import SIGReg
+from torchrl_ficreg.objectives.vicreg import CovariancePenalty, TemporalStraightness, VarianceHinge
 
-__all__ = ["FICRegLoss", "LeWMLoss", "SIGReg", "gradient_flow"]
+__all__ = [
+    "CovariancePenalty",
+    "FICRegLoss",
+    "JointInverseLoss",
+    "LatentHealth",
+    "LeWMLoss",
+    "PLDMLoss",
+    "SIGReg",
+    "TemporalStraightness",
+    "VarianceHinge",
+    "gradient_flow",
+    "latent_health",
+]

@@ -5,13 +5,16 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch, TensorDictModule
-from torch import nn
 
-from torchrl_ficreg.objectives.lewm import _call, _Clip, LeWMLoss
+from torchrl_ficreg.modules.inverse import LOG_VAR
+from torchrl_ficreg.objectives.base import Reduction, with_own_buffers
+from torchrl_ficreg.objectives.clip import Clip
+from torchrl_ficreg.objectives.judge import inverse_error, judge_report, Recovered, trust
+from torchrl_ficreg.objectives.lewm import LeWMLoss
 from torchrl_ficreg.objectives.sigreg import SIGReg
-from torchrl_ficreg.objectives.terms import squared_error
+from torchrl_ficreg.objectives.terms import gaussian_nll, squared_error
 
 
 class FICRegLoss(LeWMLoss):
@@ -41,16 +44,29 @@ class FICRegLoss(LeWMLoss):
     The clip is that of :class:`LeWMLoss`. All random draws of the baseline terms come first, so that under one seed
     the encoder's gradient equals that of :class:`LeWMLoss` to the last bit.
 
+    The arguments from ``consistency`` on go beyond the paper; their defaults are the paper.
+
     Args:
         encoder, predictor: see :class:`LeWMLoss`.
-        inverse_model: reads two latents [..., D], writes the action block between them [..., F * A].
+        inverse_model: reads two latents [..., D], writes the action block between them [..., F * A] and, where it
+            knows, how sure it is; see :class:`~torchrl_ficreg.InverseDynamicsModel`.
         sigreg, sigreg_coeff, reduction: see :class:`LeWMLoss`.
         idm_coeff: mu, weight of the inverse model's own loss.
         consistency_coeff: gamma, weight of the judgement on imagined transitions.
         context: ``"detached"`` or ``"live"``, see above.
+        consistency: ``"mse"``; ``"nll"``, the likelihood under a Gaussian judge; or ``"trusted"``, the squared error
+            weighted, for every sample and action dimension, by how well the judge does on the real transition of the
+            same clip (:func:`~torchrl_ficreg.objectives.judge.trust`): where it cannot tell, it does not push.
+        consistency_target: ``"action"``, the one taken, or ``"judge"``, what the judge recovers from the *real*
+            transition: predictions are then not rewarded for carrying more of the action than reality does, as at
+            walls and contacts.
+        consistency_steps: k; also judges imagined transitions 2 to k steps deep, each fed by predictions.
+        diagnostics: also write, detached, ``judge_r2_real``, ``judge_r2_imagined`` and ``judge_r2_shuffled`` [F * A]
+            (:func:`~torchrl_ficreg.objectives.judge.judge_report`) and ``judge_trust`` [F * A], the mean weight.
 
     Raises:
-        KeyError, ValueError, TypeError: see :class:`LeWMLoss`; ValueError for an unknown context.
+        KeyError, ValueError, TypeError: see :class:`LeWMLoss`; ValueError for an unknown choice, for ``"nll"`` without
+            a Gaussian judge, and for clips of fewer than ``consistency_steps`` + 1 frames.
 
     Examples:
         >>> import torch
@@ -69,10 +85,6 @@ class FICRegLoss(LeWMLoss):
     _networks = ("encoder", "predictor", "inverse_model")
     _schedulable_buffers = frozenset({"idm_coeff", "consistency_coeff"})
 
-    inverse_model: TensorDictModule
-    inverse_model_params: TensorDictParams
-    target_inverse_model_params: TensorDictParams
-
     def __init__(
         self,
         encoder: TensorDictModule,
@@ -84,36 +96,114 @@ class FICRegLoss(LeWMLoss):
         idm_coeff: float = 0.1,
         consistency_coeff: float = 0.1,
         context: Literal["detached", "live"] = "detached",
-        reduction: Literal["mean", "sum", "none"] = "mean",
+        reduction: Reduction = "mean",
+        consistency: Literal["mse", "nll", "trusted"] = "mse",
+        consistency_target: Literal["action", "judge"] = "action",
+        consistency_steps: int = 1,
+        diagnostics: bool = False,
     ) -> None:
-        super().__init__(encoder, predictor, sigreg=sigreg, sigreg_coeff=sigreg_coeff, reduction=reduction)
-        if context not in ("detached", "live"):
-            raise ValueError(f"unknown context {context!r}: choose 'detached' or 'live'.")
-        self.context = context
-        self.convert_to_functional(inverse_model, "inverse_model")
-        self.register_coeff_buffer("idm_coeff", idm_coeff)
-        self.register_coeff_buffer("consistency_coeff", consistency_coeff)
+        super().__init__(
+            encoder,
+            predictor,
+            sigreg=sigreg,
+            sigreg_coeff=sigreg_coeff,
+            reduction=reduction,
+            inverse_model=inverse_model,
+        )
+        self._register_coefficients(idm_coeff=idm_coeff, consistency_coeff=consistency_coeff)
+        _check("context", context, ("detached", "live"))
+        _check("consistency", consistency, ("mse", "nll", "trusted"))
+        _check("consistency_target", consistency_target, ("action", "judge"))
+        if consistency_steps < 1:
+            raise ValueError(f"consistency_steps must be positive, got {consistency_steps}.")
+        if consistency == "nll" and LOG_VAR not in inverse_model.out_keys:
+            raise ValueError(f"consistency='nll' needs a judge that writes {LOG_VAR!r}: InverseDynamicsModel(kind='gaussian').")
+        self.context, self.consistency, self.consistency_target = context, consistency, consistency_target
+        self.consistency_steps, self.diagnostics = consistency_steps, diagnostics
+        if diagnostics:
+            self.out_keys = [*self.out_keys, "judge_r2_real", "judge_r2_imagined", "judge_r2_shuffled", "judge_trust"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
-        clip = _Clip.read(tensordict, self.tensor_keys)
-        latent, predicted = self._encode_and_predict(clip)
+        clip = self._read(tensordict)
+        latent = self._encode(clip.pixels)  # [B, T, D]
+        predicted = self._predict(latent[..., :-1, :], clip.action, self.predictor_params)  # [B, T - 1, D]
         terms = self._baseline_terms(clip, latent, predicted)
-        real = latent.detach()  # [B, T, D]: nothing below reaches the encoder, except predicted in a live context
-        if self.context == "detached":
-            predicted = self._predict(real[..., :-1, :], clip.action, _with_own_buffers(self.predictor_params))
+        real = latent.detach()  # nothing below reaches the encoder, except predicted in a live context
         recovered = self._recover(real[..., :-1, :], real[..., 1:, :], self.inverse_model_params)
-        judged = self._recover(real[..., :-1, :], predicted, self.inverse_model_params.detach())
-        terms["loss_idm"] = self.idm_coeff * self._reduce(squared_error(recovered, clip.action), clip)
-        terms["loss_consistency"] = self.consistency_coeff * self._reduce(squared_error(judged, clip.action), clip)
+        error = inverse_error(recovered, clip.action).mean(-1)  # [B, T - 1]
+        terms["loss_idm"] = self.idm_coeff * self._reduce(error, clip.mask)
+        terms |= self._judge(clip, real, predicted, recovered.action.detach())
         return TensorDict(terms)
 
-    def _recover(self, latent: torch.Tensor, next_latent: torch.Tensor, params: TensorDictBase) -> torch.Tensor:
-        """Action blocks [B, T - 1, F * A] that lead from latent to next_latent [B, T - 1, D]."""
-        return _call(self.inverse_model, params, latent, next_latent)
+    def _judge(
+        self, clip: Clip, real: torch.Tensor, predicted: torch.Tensor, recovered: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """``loss_consistency`` (predictor only) and, if asked for, the detached report.
+
+        Args:
+            clip: the clip.
+            real: detached latents [B, T, D].
+            predicted: live predictions [B, T - 1, D], used in a live context.
+            recovered: detached actions recovered from the real transitions [B, T - 1, F * A].
+        """
+        frozen = self.inverse_model_params.detach()
+        params = with_own_buffers(self.predictor_params)
+        if self.context == "detached":
+            predicted = self._predict(real[..., :-1, :], clip.action, params)
+        target = clip.action if self.consistency_target == "action" else recovered
+        weight = self._weight(recovered, clip.action)
+        total, count = None, None
+        before, mask = real[..., :-1, :], clip.mask  # [B, T - 1, ...]
+        verdict = None
+        for step in range(self._steps(clip)):
+            if step:  # one more step deep, from one frame further on
+                before = predicted[..., :-1, :].detach()
+                predicted = self._predict(predicted[..., :-1, :], clip.action[..., step:, :], params)
+                mask = None if mask is None else mask[..., 1:] & mask[..., :-1]
+            judged = self._recover(before, predicted, frozen)  # [B, T - 1 - step, F * A]
+            verdict = judged.action if verdict is None else verdict
+            error = self._consistency_error(judged, target[..., step:, :], weight[..., step:, :]).mean(-1)
+            error, seen = _select(error, mask)
+            pad = (step, 0)  # transitions near the start are not reached by deep steps
+            error, seen = (torch.nn.functional.pad(value, pad) for value in (error, seen))  # [B, T - 1]
+            total, count = (error, seen) if total is None else (total + error, count + seen)
+        terms = {"loss_consistency": self.consistency_coeff * self._reduce(total / count.clamp_min(1), clip.mask)}
+        if self.diagnostics:
+            terms |= judge_report(recovered, verdict, clip.action, clip.mask)
+            terms["judge_trust"] = weight.detach().flatten(0, -2).mean(0)
+        return terms
+
+    def _steps(self, clip: Clip) -> int:
+        if clip.action.shape[-2] < self.consistency_steps:
+            raise ValueError(
+                f"consistency_steps={self.consistency_steps} needs clips of {self.consistency_steps + 1} frames, got "
+                f"{clip.action.shape[-2] + 1}: sample longer clips (num_frames)."
+            )
+        return self.consistency_steps
+
+    def _weight(self, recovered: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Weight of the judgement on every transition, [B, T - 1, F * A]; ones unless it is ``"trusted"``."""
+        if self.consistency != "trusted":
+            return torch.ones_like(action)
+        return trust(squared_error(recovered, action)).to(action.dtype)
+
+    def _consistency_error(self, judged: Recovered, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+        """[..., F * A]."""
+        if self.consistency == "nll":
+            return gaussian_nll(judged.action, judged.log_var, target)
+        error = squared_error(judged.action, target)
+        return weight * error if self.consistency == "trusted" else error
 
 
-def _with_own_buffers(params: TensorDictParams) -> TensorDictBase:
-    """The same parameters beside copies of the buffers, so that BatchNorm statistics move once a step, not twice."""
-    return params.apply(lambda value: value if isinstance(value, nn.Parameter) else value.clone())
+def _select(error: torch.Tensor, mask: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Errors with masked ones selected away, and 1 where one counts; both [B, N]."""
+    if mask is None:
+        return error, torch.ones_like(error)
+    return torch.where(mask, error, 0.0), mask.to(error.dtype)
+
+
+def _check(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise ValueError(f"unknown {name} {value!r}: choose one of {', '.join(map(repr, allowed))}.")

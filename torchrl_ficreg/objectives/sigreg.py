@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from typing import Literal
+
 import torch
 from torch import nn
-from torch.autograd.function import once_differentiable
+
+from torchrl_ficreg.objectives.epps_pulley import epps_pulley
 
 
 class SIGReg(nn.Module):
@@ -18,13 +22,24 @@ class SIGReg(nn.Module):
     by the trapezoidal rule, then averaged over directions and time steps. The value on N(0, I) is about 1.05 at any
     batch size; collapse to a point at zero gives 0.402 B. Because of the factor B a weight belongs to a batch size.
 
+    Directions are drawn anew at every call in train mode, from a generator of the module's own: its state is a buffer,
+    so it travels with checkpoints, and neither the global random state nor the device takes part. In eval mode the
+    next directions are looked at without being used up.
+
+    On several processes (``torch.distributed`` initialised) all ranks draw the same directions and the statistic is
+    that of the global batch. Its gradient follows the convention of distributed data parallel training: averaged over
+    ranks, parameter gradients are those of one process on the whole batch.
+
     Args:
-        num_directions: M, drawn anew at every call from torch's global generator.
+        num_directions: M.
         num_knots: knots on [0, t_max].
         max_knot: t_max.
+        unit: what one sample is: ``"time"`` tests every time step of a [T, B, D] batch on its own, as published,
+            ``"batch_time"`` all T x B latents together.
+        seed: of the directions.
 
     Raises:
-        ValueError: fewer than one direction or two knots, or latents that are not [T, B, D] with B >= 2.
+        ValueError: an argument out of range, or latents that are not [T, B, D] or [B, D] with B >= 2.
 
     Examples:
         >>> _ = torch.manual_seed(0)
@@ -32,70 +47,90 @@ class SIGReg(nn.Module):
         1.1
     """
 
-    def __init__(self, num_directions: int = 1024, num_knots: int = 17, max_knot: float = 3.0) -> None:
+    def __init__(
+        self,
+        num_directions: int = 1024,
+        num_knots: int = 17,
+        max_knot: float = 3.0,
+        *,
+        unit: Literal["time", "batch_time"] = "time",
+        seed: int = 0,
+    ) -> None:
         super().__init__()
         if num_directions < 1 or num_knots < 2 or max_knot <= 0:
             raise ValueError(
                 "SIGReg needs num_directions >= 1, num_knots >= 2 and max_knot > 0, "
                 f"got {num_directions}, {num_knots} and {max_knot}."
             )
-        self.num_directions = num_directions
-        self.knot_step = max_knot / (num_knots - 1)
-        knots = torch.arange(1, num_knots) * self.knot_step  # the knot at 0 contributes nothing
-        gaussian = torch.exp(-knots.square() / 2)
-        widths = torch.full_like(knots, 2 * self.knot_step)  # both halves of a symmetric integral
-        widths[-1] = self.knot_step
-        self.register_buffer("gaussian", gaussian, persistent=False)  # [K]
-        self.register_buffer("weight", widths * gaussian, persistent=False)  # [K]
+        if unit not in ("time", "batch_time"):
+            raise ValueError(f"unknown unit {unit!r}: choose 'time' or 'batch_time'.")
+        self.num_directions, self.num_knots, self.max_knot, self.unit = num_directions, num_knots, max_knot, unit
+        self.register_buffer("generator_state", torch.tensor([seed, 0]))  # seed, number of draws
 
-    def forward(self, latent: torch.Tensor) -> torch.Tensor:
-        """Latents [T, B, D], or [B, D] -> the statistic [], float32 inside any autocast."""
+    def forward(self, latent: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """Latents [T, B, D], or [B, D] -> the statistic [], at least float32 inside any autocast.
+
+        Args:
+            latent: [T, B, D] or [B, D].
+            mask: [T, B] or [B] bool; false latents are left out, whatever they hold.
+        """
         if latent.ndim not in (2, 3) or latent.shape[-2] < 2:
             raise ValueError(f"SIGReg takes latents [T, B, D] or [B, D] with B >= 2, got {list(latent.shape)}.")
+        if mask is not None and (mask.shape != latent.shape[:-1] or mask.dtype != torch.bool):
+            raise ValueError(f"the mask must be {list(latent.shape[:-1])} bool, got {list(mask.shape)} {mask.dtype}.")
+        lead = (1, -1) if latent.ndim == 2 or self.unit == "batch_time" else latent.shape[:2]
+        mask = None if mask is None else mask.reshape(lead)  # [T, B]
         with torch.autocast(latent.device.type, enabled=False):
-            latent = latent.float()
-            directions = torch.randn(latent.shape[-1], self.num_directions, device=latent.device)  # [D, M]
-            directions = directions / directions.norm(dim=0)
-            angle = latent @ (self.knot_step * directions)  # [T, B, M]: angle at the first knot
-            return _EppsPulley.apply(angle, self.gaussian, self.weight).mean()
+            latent = latent.reshape(*lead, latent.shape[-1])
+            latent = latent if latent.dtype == torch.float64 else latent.float()  # [T, B, D]
+            if mask is not None:
+                latent = torch.where(mask.unsqueeze(-1), latent, 0.0)
+            step = self.max_knot / (self.num_knots - 1)
+            directions = self._draw(latent.shape[-1]).to(latent.dtype)  # [D, M]
+            knots = torch.arange(1, self.num_knots, device=latent.device, dtype=latent.dtype) * step  # 0 adds nothing
+            gaussian = torch.exp(-knots.square() / 2)  # [K]
+            width = torch.full_like(knots, 2 * step)  # both halves of a symmetric integral
+            width = torch.cat([width[:-1], width[-1:] / 2])
+            return epps_pulley(latent @ (step * directions), mask, gaussian, width * gaussian).mean()
+
+    def _draw(self, dim: int) -> torch.Tensor:
+        """Unit vectors [D, M] float32."""
+        state = self.generator_state.clone()
+        if self.training:
+            self.generator_state[1] += 1
+        directions = standard_normal(state, dim * self.num_directions).view(dim, self.num_directions)
+        return directions / directions.norm(dim=0)
 
 
-class _EppsPulley(torch.autograd.Function):
-    """Epps-Pulley statistic of angles [..., B, M] -> [..., M].
+def standard_normal(state: torch.Tensor, count: int) -> torch.Tensor:
+    """Standard normal numbers from a counter: a pure function of (seed, draw), the same on every device and rank.
 
-    All knots are multiples of the first, so one sine and cosine per angle give the others by angle addition. The
-    gradient is a trigonometric polynomial in the same pair, evaluated by Horner's rule: two tensors are kept, not
-    one pair for every knot.
+    A host-side generator cannot be traced by ``torch.compile(fullgraph=True)`` and would have to be kept equal across
+    ranks; a hash of the position (SplitMix64, Steele et al. 2014) followed by Box-Muller needs neither.
+
+    Args:
+        state: [2] int64, seed and number of the draw.
+        count: numbers wanted.
+
+    Returns:
+        [count] float32.
     """
+    half = (count + 1) // 2
+    position = torch.arange(2 * half, device=state.device)  # int64; products wrap around
+    stream = _mix(_mix(state[:1] * _GOLDEN + 1) + state[1:])
+    bits = _mix(stream + (position + 1) * _GOLDEN)
+    # The upper 24 bits fill a float32 mantissa; half a unit keeps the logarithm finite.
+    uniform = (((bits >> 40) & 0xFFFFFF).float() + 0.5) / 2**24
+    radius = (-2 * uniform[:half].log()).sqrt()
+    angle = 2 * math.pi * uniform[half:]
+    return torch.cat([radius * angle.cos(), radius * angle.sin()])[:count]
 
-    @staticmethod
-    def forward(ctx, angle: torch.Tensor, gaussian: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-        cos, sin = angle.cos(), angle.sin()  # [..., B, M]
-        knot_cos, knot_sin = cos, sin
-        real, imaginary = [cos.mean(-2)], [sin.mean(-2)]
-        for _ in range(len(gaussian) - 1):
-            knot_cos, knot_sin = knot_cos * cos - knot_sin * sin, knot_sin * cos + knot_cos * sin
-            real.append(knot_cos.mean(-2))
-            imaginary.append(knot_sin.mean(-2))
-        deviation = torch.stack(real, -1) - gaussian  # [..., M, K]
-        skew = torch.stack(imaginary, -1)  # [..., M, K]
-        ctx.save_for_backward(cos, sin, deviation, skew, weight)
-        return angle.shape[-2] * ((deviation.square() + skew.square()) @ weight)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad: torch.Tensor) -> tuple[torch.Tensor, None, None]:
-        cos, sin, deviation, skew, weight = ctx.saved_tensors
-        order = torch.arange(1, len(weight) + 1, device=weight.device, dtype=weight.dtype)
-        slope = (2 * order * weight) * grad.unsqueeze(-1)  # [..., M, K]
-        # d/d(angle) = sum_k slope_k (skew_k cos(k angle) - deviation_k sin(k angle)), the real part of
-        # sum_k slope_k (skew_k + i deviation_k) exp(i k angle).
-        real = (slope * skew).movedim(-1, 0).unsqueeze(-2)  # [K, ..., 1, M]
-        imaginary = (slope * deviation).movedim(-1, 0).unsqueeze(-2)
-        total_real, total_imaginary = real[-1], imaginary[-1]
-        for k in range(len(weight) - 2, -1, -1):
-            total_real, total_imaginary = (
-                total_real * cos - total_imaginary * sin + real[k],
-                total_imaginary * cos + total_real * sin + imaginary[k],
-            )
-        return total_real * cos - total_imaginary * sin, None, None
+_GOLDEN = 0x9E3779B97F4A7C15 - 2**64
+
+
+def _mix(bits: torch.Tensor) -> torch.Tensor:
+    """Finaliser of SplitMix64 on int64; shifts are made logical by masking."""
+    bits = (bits ^ ((bits >> 30) & (2**34 - 1))) * (0xBF58476D1CE4E5B9 - 2**64)
+    bits = (bits ^ ((bits >> 27) & (2**37 - 1))) * (0x94D049BB133111EB - 2**64)
+    return bits ^ ((bits >> 31) & (2**33 - 1))

@@ -1,0 +1,95 @@
+"""Prediction with an inverse model that is trained together with the encoder."""
+
+from __future__ import annotations
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch, TensorDictModule
+
+from torchrl_ficreg.objectives.base import Reduction
+from torchrl_ficreg.objectives.judge import inverse_error
+from torchrl_ficreg.objectives.lewm import LeWMLoss
+from torchrl_ficreg.objectives.sigreg import SIGReg
+
+
+class JointInverseLoss(LeWMLoss):
+    r"""Latent prediction whose encoder is shaped by the inverse model, with or without SIGReg.
+
+    .. math:: \|g_\phi(z_{1:t}, a_t) - z_{t+1}\|^2 + \lambda \, \mathrm{SIGReg}(Z) + \mu \|h_\psi(z_t, z_{t+1}) - a_t\|^2
+
+    As in ICM (arXiv 1705.05363), PLDM (arXiv 2502.14819) and sensorimotor world models (SMWM, arXiv 2606.20104): what
+    carries no trace of the action may be forgotten, so the inverse loss alone can keep the latents from collapsing
+    (``sigreg_coeff=0``, SMWM). It is the baseline that FICReg argues against: there the encoder never sees this
+    gradient.
+
+    ====================  =======  =========  =============
+    term                  encoder  predictor  inverse model
+    ====================  =======  =========  =============
+    ``loss_pred``         yes      yes        no
+    ``loss_sigreg``       yes      no         no
+    ``loss_idm``          **yes**  no         yes
+    ====================  =======  =========  =============
+
+    The clip is that of :class:`~torchrl_ficreg.LeWMLoss`. With ``sigreg_coeff=0`` at construction the regulariser is not computed and
+    ``loss_sigreg`` not written.
+
+    Args:
+        encoder, predictor, sigreg, sigreg_coeff, reduction: see :class:`~torchrl_ficreg.LeWMLoss`.
+        inverse_model: see :class:`~torchrl_ficreg.FICRegLoss`.
+        idm_coeff: mu. SMWM tunes it from 0.1 to 30 by task.
+
+    Raises:
+        KeyError, ValueError, TypeError: see :class:`~torchrl_ficreg.LeWMLoss`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_ficreg import JointInverseLoss, ModelConfig, make_world_model
+        >>> model, inverse_model = make_world_model(ModelConfig.preset("cpu"), action_dim=2)
+        >>> loss = JointInverseLoss(model.encoder, model.predictor, inverse_model, sigreg_coeff=0.0)
+        >>> pixels = torch.randint(0, 256, (8, 2, 3, 64, 64), dtype=torch.uint8)
+        >>> output = loss(TensorDict({"pixels": pixels, "action": torch.randn(8, 2, 10)}, [8, 2]))
+        >>> sum(output.values()).backward()
+        >>> sorted(output.keys())
+        ['loss_idm', 'loss_pred']
+    """
+
+    out_keys = ["loss_pred", "loss_sigreg", "loss_idm"]
+    _networks = ("encoder", "predictor", "inverse_model")
+    _schedulable_buffers = frozenset({"idm_coeff"})
+
+    def __init__(
+        self,
+        encoder: TensorDictModule,
+        predictor: TensorDictModule,
+        inverse_model: TensorDictModule,
+        *,
+        sigreg: SIGReg | None = None,
+        sigreg_coeff: float = 0.09,
+        idm_coeff: float = 1.0,
+        reduction: Reduction = "mean",
+    ) -> None:
+        super().__init__(
+            encoder,
+            predictor,
+            sigreg=sigreg,
+            sigreg_coeff=sigreg_coeff,
+            reduction=reduction,
+            inverse_model=inverse_model,
+        )
+        self._register_coefficients(idm_coeff=idm_coeff)
+        self.regularised = sigreg_coeff > 0
+        self.out_keys = ["loss_pred", "loss_sigreg", "loss_idm"] if self.regularised else ["loss_pred", "loss_idm"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Computes the terms; see the class."""
+        clip = self._read(tensordict)
+        latent = self._encode(clip.pixels)  # [B, T, D]
+        predicted = self._predict(latent[..., :-1, :], clip.action, self.predictor_params)  # [B, T - 1, D]
+        recovered = self._recover(latent[..., :-1, :], latent[..., 1:, :], self.inverse_model_params)
+        terms = {"loss_pred": self._prediction(clip, latent, predicted)}
+        if self.regularised:
+            terms["loss_sigreg"] = self.sigreg_coeff * self._spread(clip, latent)
+        error = inverse_error(recovered, clip.action).mean(-1)  # [B, T - 1]
+        terms["loss_idm"] = self.idm_coeff * self._reduce(error, clip.mask)
+        return TensorDict(terms)

@@ -1,0 +1,79 @@
+"""The frozen inverse model as a judge: what it says, how far it is trusted, and whether it is worth listening to."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from torchrl_ficreg.objectives.terms import gaussian_nll, squared_error
+
+
+class Recovered(NamedTuple):
+    """What an inverse model makes of transitions, each [..., F * A].
+
+    Attributes:
+        action: recovered action blocks.
+        log_var: their log-variance, from a Gaussian head; else None.
+        spread: variance among the members of an ensemble; else None.
+    """
+
+    action: torch.Tensor
+    log_var: torch.Tensor | None
+    spread: torch.Tensor | None
+
+
+def inverse_error(recovered: Recovered, action: torch.Tensor) -> torch.Tensor:
+    """Training error of an inverse model by dimension, [..., F * A].
+
+    Negative log-likelihood for a Gaussian head; for an ensemble the mean over members of each one's squared error,
+    which is that of their mean plus their variance; the squared error else.
+    """
+    if recovered.log_var is not None:
+        return gaussian_nll(recovered.action, recovered.log_var, action)
+    error = squared_error(recovered.action, action)
+    return error if recovered.spread is None else error + recovered.spread
+
+
+def trust(real_error: torch.Tensor) -> torch.Tensor:
+    """Weight of a judgement from the judge's squared error on the real transition, [..., F * A] -> the same in [0, 1].
+
+    Actions are z-scored, so a judge that knows nothing errs by 1 on average: 1 - error, at least 0, is its R² on this
+    very sample and dimension. Where it cannot tell, it does not push.
+    """
+    return (1 - real_error.detach()).clamp(0, 1)
+
+
+def judge_report(
+    real: torch.Tensor, imagined: torch.Tensor, action: torch.Tensor, mask: torch.Tensor | None
+) -> dict[str, torch.Tensor]:
+    """How good the judge is, per action dimension, all detached.
+
+    The shuffled control compares its verdicts on imagined transitions with the actions of *other* samples: a judge
+    that likes wrong actions as well is worthless, and its number there is not clearly below the true one.
+
+    Args:
+        real, imagined: actions recovered from real and imagined transitions, [..., T, F * A].
+        action: those taken.
+        mask: [..., T] bool, or None.
+
+    Returns:
+        ``judge_r2_real``, ``judge_r2_imagined`` and ``judge_r2_shuffled``, each [F * A]; at most 1, and 0 or less for
+        a judge that knows nothing.
+    """
+    with torch.no_grad():
+        shuffled = action.roll(1, 0)
+        rows = {"real": (real, action), "imagined": (imagined, action), "shuffled": (imagined, shuffled)}
+        return {f"judge_r2_{name}": _explained(guess, truth, mask) for name, (guess, truth) in rows.items()}
+
+
+def _explained(guess: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    guess, truth = guess.float().flatten(0, -2), truth.float().flatten(0, -2)  # [N, F * A]
+    keep = torch.ones_like(guess[:, 0], dtype=torch.bool) if mask is None else mask.flatten()  # [N]
+    count = keep.sum().clamp_min(1)
+
+    def mean(value: torch.Tensor) -> torch.Tensor:
+        return torch.where(keep.unsqueeze(-1), value, 0.0).sum(0) / count  # [F * A]
+
+    variance = mean((truth - mean(truth)).square())
+    return 1 - mean((guess - truth).square()) / variance.clamp_min(1e-8)

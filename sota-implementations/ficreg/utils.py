@@ -61,7 +61,8 @@ def collect_dataset(cfg: DictConfig) -> Path:
         "action_low": low,
         "action_high": high,
     }
-    with EpisodeWriter(path, target_episodes=data.episodes, meta=meta) as writer:
+    # Several runs may be started at once: one of them records, the others wait for it.
+    with EpisodeWriter(path, target_episodes=data.episodes, meta=meta, wait=True) as writer:
         if writer.complete:
             return path
         episodes = collect_episodes(

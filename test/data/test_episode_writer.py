@@ -18,6 +18,7 @@ import json
 import multiprocessing
 import os
 import signal
+import threading
 import time
 
 import numpy as np
@@ -199,6 +200,25 @@ def test_a_second_writer_is_refused_until_the_first_is_gone(tmp_path, make_episo
     first.close()
     with EpisodeWriter(tmp_path, target_episodes=2, meta=meta) as second:
         assert second.complete and second.num_steps == 40
+
+
+def test_a_waiting_writer_begins_when_the_first_is_done(tmp_path, make_episode, meta):
+    """Two runs started at once share one recording: it is made once."""
+    first = EpisodeWriter(tmp_path, target_episodes=2, meta=meta)
+    first.append(make_episode(1))
+    found = []
+
+    def record():
+        with EpisodeWriter(tmp_path, target_episodes=2, meta=meta, wait=True) as writer:
+            found.append(writer.num_episodes)
+
+    waiting = threading.Thread(target=record)
+    waiting.start()
+    first.append(make_episode(2))
+    assert not found
+    first.close()
+    waiting.join(timeout=10)
+    assert found == [2]
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,8 @@ def command() -> Callable[..., list[str]]:
 @pytest.fixture(scope="session")
 def environment() -> dict[str, str]:
     """One thread, and a logger that stays off the network."""
-    return {**os.environ, "OMP_NUM_THREADS": "1", "WANDB_MODE": "offline"}
+    quiet = {"WANDB_MODE": "offline", "WANDB_X_SERVICE_WAIT": "120"}  # its service starts slowly on a busy machine
+    return {**os.environ, "OMP_NUM_THREADS": "1", **quiet}
 
 
 @pytest.fixture(scope="session")

@@ -48,6 +48,7 @@ class EpisodeWriter:
         meta: whatever reproduces the data (environment, its arguments, image size, seed, expert, action bounds);
             anything JSON can hold, numpy values included.
         resume: continue an existing dataset. With ``False`` an existing dataset is an error.
+        wait: let another writer of the same dataset finish first. With ``False`` it is an error.
 
     Raises:
         FileExistsError: the dataset exists and ``resume`` is false.
@@ -75,7 +76,7 @@ class EpisodeWriter:
     """
 
     def __init__(
-        self, path: str | Path, *, target_episodes: int, meta: Mapping[str, Any], resume: bool = True
+        self, path: str | Path, *, target_episodes: int, meta: Mapping[str, Any], resume: bool = True, wait: bool = False
     ) -> None:
         if target_episodes < 1:
             raise ValueError(f"target_episodes must be at least 1, got {target_episodes}.")
@@ -92,7 +93,7 @@ class EpisodeWriter:
         self.path.mkdir(parents=True, exist_ok=True)
         self._index = os.open(self.path / INDEX_FILE, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         try:
-            self._lock()
+            self._lock(wait)
             if (self.path / META_FILE).exists():
                 self._resume()
             elif os.fstat(self._index).st_size:
@@ -172,10 +173,10 @@ class EpisodeWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _lock(self) -> None:
+    def _lock(self, wait: bool) -> None:
         # The lock belongs to the open file, so the kernel drops it when the process dies, however it dies.
         try:
-            fcntl.flock(self._index, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._index, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as error:
             raise RuntimeError(f"another writer has {self.path} open: wait for it or use another path.") from error
 

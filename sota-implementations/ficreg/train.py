@@ -15,6 +15,7 @@ import torch
 from cli import entry_point
 from omegaconf import DictConfig
 from utils import (
+    add_hooks,
     check_settings,
     claim_run_dir,
     collect_dataset,
@@ -75,6 +76,7 @@ def train(cfg: DictConfig, data: Path, run_dir: Path) -> tuple[LatentWorldModel,
         logger=make_logger(cfg, run_dir),
         **{key: value for key, value in cfg.optim.items() if key != "batch_size"},
     )
+    add_hooks(cfg, trainer)
     resumed_at = trainer.step if trainer.resume() else 0
     trainer.train()
     training = {

@@ -17,12 +17,23 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import get_logger, Logger
 from tqdm import tqdm
 
-from torchrl_ficreg import FICRegLoss, LatentCEMPlanner, LatentWorldModel, LeWMLoss, ModelConfig, MPCPolicy, PlanConfig
+from torchrl_ficreg import (
+    FICRegLoss,
+    JointInverseLoss,
+    LatentCEMPlanner,
+    LatentWorldModel,
+    LeWMLoss,
+    make_world_model,
+    ModelConfig,
+    MPCPolicy,
+    PlanConfig,
+    PLDMLoss,
+)
 from torchrl_ficreg.data import EpisodeWriter, OfflineTrajectories
 from torchrl_ficreg.envs import collect_episodes, make_env
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
 from torchrl_ficreg.modules.precision import uses_bf16
-from torchrl_ficreg.trainers import ModelCard
+from torchrl_ficreg.trainers import CoefficientSchedule, LatentAlarm, ModelCard, OfflineTrainer
 from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS
 from torchrl_ficreg.trainers.offline import METRICS
 
@@ -107,9 +118,25 @@ def model_config(cfg: DictConfig) -> ModelConfig:
 
 def make_loss(cfg: DictConfig, model: LatentWorldModel, inverse_model: InverseDynamicsModel) -> LeWMLoss:
     """The loss of a configuration's ``method``."""
+    networks, weights = (model.encoder, model.predictor, inverse_model), cfg.loss
+    settings = {key: value for key, value in cfg.method.items() if key not in ("name", "consistency_warmup")}
     if cfg.method.name == "lewm":
-        return LeWMLoss(model.encoder, model.predictor, sigreg_coeff=cfg.loss.sigreg_coeff)
-    return FICRegLoss(model.encoder, model.predictor, inverse_model, context=cfg.method.context, **cfg.loss)
+        return LeWMLoss(*networks[:2], sigreg_coeff=weights.sigreg_coeff)
+    if cfg.method.name == "joint_inverse":
+        return JointInverseLoss(*networks, sigreg_coeff=weights.sigreg_coeff, idm_coeff=weights.idm_coeff)
+    if cfg.method.name == "pldm":
+        return PLDMLoss(*networks, **settings)
+    return FICRegLoss(*networks, **settings, **weights)
+
+
+def add_hooks(cfg: DictConfig, trainer: OfflineTrainer) -> None:
+    """The alarm, and the warm-up of FICReg's coefficient where one is asked for."""
+    LatentAlarm(cfg.logger.alarm_interval, cfg.optim.precision, trainer.metrics_table).register(trainer)
+    share = cfg.method.get("consistency_warmup", 0.0)
+    if share > 0:
+        full = cfg.loss.consistency_coeff
+        ramp = CoefficientSchedule("consistency_coeff", lambda done: full * min(1.0, done / share), trainer.total_steps)
+        ramp.register(trainer)
 
 
 def make_logger(cfg: DictConfig, run_dir: Path) -> Logger | None:
@@ -177,14 +204,17 @@ def check_settings(cfg: DictConfig) -> None:
     get_device(cfg.device)
     if cfg.logger.backend not in ("csv", "wandb", "tensorboard"):
         raise ValueError(f"unknown logger.backend {cfg.logger.backend!r}: choose csv, wandb or tensorboard.")
-    if cfg.method.name == "ficreg" and cfg.method.context not in ("detached", "live"):
-        raise ValueError(f"unknown method.context {cfg.method.context!r}: choose detached or live.")
+    model, inverse_model = make_world_model(model_config(cfg), action_dim=1)
+    make_loss(cfg, model, inverse_model)
+    if not 0 <= cfg.method.get("consistency_warmup", 0.0) <= 1:
+        raise ValueError(f"method.consistency_warmup must lie in [0, 1], got {cfg.method.consistency_warmup}.")
     optim, evaluation = cfg.optim, cfg.evaluation
     positive = {"optim.epochs": optim.epochs, "optim.batch_size": optim.batch_size, "optim.lr": optim.lr}
     positive |= {"optim.clip_norm": optim.clip_norm, "env.data.episodes": cfg.env.data.episodes}
     positive |= {"env.budget": cfg.env.budget, "env.goal_offset": cfg.env.goal_offset}
     positive |= {"evaluation.num_pairs": evaluation.num_pairs, "evaluation.num_envs": evaluation.num_envs}
     positive |= {"evaluation.record": evaluation.record, "logger.interval": cfg.logger.interval}
+    positive |= {"logger.alarm_interval": cfg.logger.alarm_interval}
     positive |= {"optim.validation_batches": optim.validation_batches, "env.data.max_steps": cfg.env.data.max_steps}
     wrong = [f"{key}={value}" for key, value in positive.items() if not value > 0]
     if wrong:

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 from torchrl_ficreg.modules.conv import ConvEncoder
-from torchrl_ficreg.modules.inverse import InverseDynamicsModel
+from torchrl_ficreg.modules.inverse import INVERSE_NETWORKS, InverseDynamicsModel
 from torchrl_ficreg.modules.predictor import CausalPredictor
 from torchrl_ficreg.modules.vit import ViTEncoder
 from torchrl_ficreg.modules.world_model import LatentWorldModel
@@ -34,13 +34,16 @@ class ModelConfig:
     predictor_mlp_dim: int = 2048
     predictor_projector_dim: int = 2048
     predictor_dropout: float = 0.1
+    inverse_kind: Literal["mlp", "gaussian", "ensemble", "transformer"] = "mlp"
     inverse_hidden_dim: int = 512  # hidden width of the inverse dynamics model
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "conv_channels", tuple(self.conv_channels))  # JSON and YAML know lists only
         if self.encoder not in ("vit", "conv"):
             raise ValueError(f"unknown encoder {self.encoder!r}: choose 'vit' or 'conv'.")
-        sizes = {name: value for name, value in asdict(self).items() if name not in ("encoder", "predictor_dropout")}
+        if self.inverse_kind not in INVERSE_NETWORKS:
+            raise ValueError(f"unknown inverse_kind {self.inverse_kind!r}: choose one of {sorted(INVERSE_NETWORKS)}.")
+        sizes = {name: value for name, value in asdict(self).items() if not isinstance(value, (str, float)) and name != "predictor_dropout"}
         sizes = {name: value if isinstance(value, tuple) else (value,) for name, value in sizes.items()}
         small = [name for name, values in sizes.items() if min(values, default=0) < 1]
         if small:
@@ -113,5 +116,8 @@ def make_world_model(config: ModelConfig, action_dim: int) -> tuple[LatentWorldM
         dropout=config.predictor_dropout,
         projector_dim=config.predictor_projector_dim,
     )
-    inverse_model = InverseDynamicsModel(config.latent_dim, block, config.inverse_hidden_dim)
+    extra = {"history": config.history} if config.inverse_kind == "transformer" else {}
+    inverse_model = InverseDynamicsModel(
+        config.latent_dim, block, config.inverse_hidden_dim, kind=config.inverse_kind, **extra
+    )
     return LatentWorldModel(encoder, predictor, frame_skip=config.frame_skip), inverse_model

@@ -15,7 +15,7 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_ficreg.data import schema
 from torchrl_ficreg.modules.inverse import LOG_VAR, SPREAD
-from torchrl_ficreg.objectives.clip import call, check_module, Clip, output, read_clip
+from torchrl_ficreg.objectives.clip import call, check_module, Clip, output, read_clip, require
 from torchrl_ficreg.objectives.judge import Recovered
 
 Reduction = Literal["mean", "sum", "none"]
@@ -118,6 +118,14 @@ class LatentLoss(LossModule):
                 f"{list(latent.shape)}."
             )
         return latent
+
+    @torch.no_grad()
+    def peek(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """Latents [T, B, D] of a clip as training sees them; random state and running statistics stay as they are."""
+        pixels = require(tensordict, self.tensor_keys.pixels)
+        with torch.random.fork_rng():
+            written = call(self.encoder, with_own_buffers(self.encoder_params), pixels)
+        return output(self.encoder, written, self.tensor_keys.latent).flatten(0, -3).transpose(0, 1)
 
     def _predict(self, latent: torch.Tensor, action: torch.Tensor, params: TensorDictBase) -> torch.Tensor:
         """Latents and action blocks [B, T - 1, ...] -> next latents [B, T - 1, D]."""

@@ -4,8 +4,11 @@ from torchrl_ficreg.trainers.checkpoint import checkpoint_components, find_check
 from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
 from torchrl_ficreg.trainers.offline import OfflineTrainer, WarmupCosine
 from torchrl_ficreg.trainers.stepper import OfflineStepper
+from torchrl_ficreg.trainers.watch import CoefficientSchedule, LatentAlarm
 
 __all__ = [
+    "CoefficientSchedule",
+    "LatentAlarm",
     "MetricsTable",
     "ModelCard",
     "OfflineStepper",

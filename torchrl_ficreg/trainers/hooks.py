@@ -37,6 +37,7 @@ class MetricsTable(TrainerHookBase):
         self.path, self.interval, self.last_step = path, interval, last_step
         self._since = (time.perf_counter(), 0)
         self._silent = True
+        self.extra: dict[str, float] = {}  # what other hooks want in every row, as LatentAlarm does
 
     def __call__(self, optim_steps: int, losses: TensorDictBase) -> dict[str, float] | None:
         """Called after every optimisation step."""
@@ -46,7 +47,7 @@ class MetricsTable(TrainerHookBase):
         self._silent = False
         now, (then, before) = time.perf_counter(), self._since
         self._since = (now, optim_steps)
-        row = {key: value.float().mean().item() for key, value in sorted(losses.items())}
+        row = {key: value.float().mean().item() for key, value in sorted(losses.items())} | self.extra
         row["steps_per_second"] = (optim_steps - before) / max(now - then, 1e-9)
         if due:
             self._write({"step": optim_steps, "split": "train", **row})

@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin/python
 READY := $(VENV)/.ready
+TESTABLE := $(VENV)/.ready-test
 PYTEST := $(RUN) -m pytest
 
 .PHONY: train test slow lint docs study clean
@@ -10,10 +11,10 @@ PYTEST := $(RUN) -m pytest
 train: $(READY)
 	$(RUN) sota-implementations/ficreg/train.py $(ARGS)
 
-test: $(READY)
+test: $(TESTABLE)
 	$(PYTEST) $(ARGS)
 
-slow: $(READY)
+slow: $(TESTABLE)
 	$(PYTEST) -m slow $(ARGS)
 
 lint: $(READY)
@@ -31,9 +32,14 @@ study: $(READY)
 
 # Everything in one call, so that pip sees all requirements at once; the marker is written only when it succeeded.
 $(READY): pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
+	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install -q -c constraints.txt -e '.[plot]'
+	touch $@
+
+$(TESTABLE): pyproject.toml constraints.txt
+	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/pip install -q -c constraints.txt -e '.[plot,test]'
-	touch $(READY)
+	touch $(READY) $@
 
 clean:
 	rm -rf $(VENV)

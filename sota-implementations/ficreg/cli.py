@@ -10,11 +10,13 @@ from pathlib import Path
 
 import hydra
 from hydra import compose, initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from tqdm import tqdm
 
 CONFIG_DIR = Path(__file__).resolve().parent / "config"
 
@@ -39,10 +41,12 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
             try:
                 main(config)
             except KeyboardInterrupt:
+                _close_bars()
                 sys.exit("interrupted: the same command continues from the last checkpoint.")
             except MISTAKES as error:
                 if os.environ.get("HYDRA_FULL_ERROR") == "1":
                     raise
+                _close_bars()
                 sys.exit(f"error: {_one_line(error)}")
 
         run.__module__ = main.__module__
@@ -50,7 +54,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
 
         def checked() -> None:
             try:
-                check_overrides(config_name, [arg for arg in sys.argv[1:] if not arg.startswith("-")])
+                check_overrides(config_name, get_args_parser().parse_args().overrides)
             except (ValueError, HydraException, OmegaConfBaseException) as error:
                 sys.exit(f"error: {_one_line(error)}")
             start()
@@ -76,7 +80,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
                 raise ValueError(f"{override.key_or_group}={override.value()} is unknown: choose one of {options}.")
     with initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
         declared = compose(config_name, chosen)
-    known = [path for path, _ in _leaves(declared)]
+    known = [*sorted(groups), *(path for path, _ in _leaves(declared))]
     for override in overrides:
         key = override.key_or_group
         if key in groups or key.startswith("hydra."):
@@ -125,6 +129,12 @@ def _leaves(config: DictConfig, prefix: str = "") -> list[tuple[str, object]]:
         path = f"{prefix}{key}"
         leaves += _leaves(node, f"{path}.") if isinstance(node, DictConfig) else [(path, node)]
     return leaves
+
+
+def _close_bars() -> None:
+    """Ends unfinished progress bars, so that the message gets a line of its own."""
+    for bar in list(getattr(tqdm, "_instances", [])):
+        bar.close()
 
 
 def _one_line(error: Exception) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cli import entry_point
 from omegaconf import DictConfig
-from utils import collect_dataset
+from utils import check_settings, collect_dataset
 
 from torchrl_ficreg.data import OfflineTrajectories
 
@@ -12,6 +12,7 @@ from torchrl_ficreg.data import OfflineTrajectories
 @entry_point("collect")
 def main(cfg: DictConfig) -> None:
     """Records what is missing and says what is there."""
+    check_settings(cfg)
     path = collect_dataset(cfg)
     dataset = OfflineTrajectories(path, split="all", num_frames=2, frame_skip=1)
     print(f"{path}: {len(dataset.episodes)} episodes, {dataset.num_steps} steps")

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from cli import entry_point
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from utils import get_device, make_policy, versions, write_json
+from utils import get_device, make_policy, report, versions, write_json
 
-from torchrl_ficreg.evaluation import evaluate_mpc, save_episodes_gif, StartGoalPairs
-from torchrl_ficreg.trainers import find_checkpoint, load_world_model
+from torchrl_ficreg.evaluation import evaluate_mpc, save_episodes_gif, StartGoalPairs, UniformPolicy
+from torchrl_ficreg.trainers import find_checkpoint, load_world_model, ModelCard
 
 
 @entry_point("evaluate")
@@ -31,24 +32,36 @@ def main(cfg: DictConfig) -> None:
     model, _, card = load_world_model(checkpoint)
     if pairs.env != card.env:
         raise ValueError(f"the model was trained on {card.env}, the pairs belong to {pairs.env}: give others, pairs=...")
-    policy = make_policy(cfg.plan, model.to(get_device(cfg.device)), card.action_low, card.action_high)
-    outcome = evaluate_mpc(
-        policy,
-        pairs,
-        budget=cfg.budget or card.config["env"]["budget"],
-        image_size=card.model["image_size"],
-        num_envs=cfg.num_envs,
-        env_kwargs=card.env_kwargs,
-        record=cfg.record,
-    )
+    plan = plan_of_run(cfg, card)
+    policy = make_policy(plan, model.to(get_device(cfg.device)), card.action_low, card.action_high)
+    shared = {
+        "budget": cfg.budget or card.config["env"]["budget"],
+        "image_size": card.model["image_size"],
+        "num_envs": cfg.num_envs,
+        "env_kwargs": card.env_kwargs,
+    }
+    method = card.config["method"]["name"]
+    outcome = evaluate_mpc(policy, pairs, record=cfg.record, description="plan", **shared)
+    floor = evaluate_mpc(UniformPolicy(card.action_low, card.action_high), pairs, description="random", **shared)
+    results = {method: outcome.summary(), "random": floor.summary(), "plan": OmegaConf.to_container(plan)}
     output = Path(cfg.output or run_dir / "evaluation")
     output.mkdir(parents=True, exist_ok=True)
-    write_json(output / "results.json", {**outcome.summary(), "plan": dict(cfg.plan), "versions": versions()})
+    write_json(output / "results.json", {**results, "checkpoint": checkpoint.name, "versions": versions()})
     if cfg.record:
         save_episodes_gif(outcome, output / "episodes.gif")
-    summary = outcome.summary()
-    low, high = summary["success_interval"]
-    print(f"success {summary['success_rate']:.1%} ({low:.1%} - {high:.1%}) on {len(pairs)} pairs; written to {output}")
+    report(results, (method, "random"), output)
+
+
+def plan_of_run(cfg: DictConfig, card: ModelCard) -> DictConfig:
+    """The plan settings of the training run, with what was typed on the command line instead."""
+    typed = [override.split("=")[0] for override in HydraConfig.get().overrides.task]
+    if "plan" in typed:
+        return cfg.plan
+    plan = OmegaConf.create(card.config["plan"])
+    for field in typed:
+        if field.startswith("plan."):
+            OmegaConf.update(plan, field.removeprefix("plan."), OmegaConf.select(cfg, field))
+    return plan
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from cli import entry_point
 from omegaconf import DictConfig
 from utils import (
     add_hooks,
+    check_run_dir,
     check_settings,
     claim_run_dir,
     collect_dataset,
@@ -26,6 +27,7 @@ from utils import (
     make_loss,
     make_policy,
     model_config,
+    report,
     versions,
     write_json,
 )
@@ -41,19 +43,21 @@ from torchrl_ficreg.evaluation import (
     UniformPolicy,
 )
 from torchrl_ficreg.trainers import checkpoint_components, ModelCard, OfflineTrainer
+from torchrl_ficreg.trainers.offline import METRICS
 
 
 @entry_point("train")
 def main(cfg: DictConfig) -> None:
     """Data, training, evaluation, report."""
     check_settings(cfg)
-    run_dir = claim_run_dir(cfg)
+    check_run_dir(cfg)
     data = collect_dataset(cfg)
     pairs = draw_pairs(cfg, data)  # before training: too few episodes shall not come to light after it
+    run_dir = claim_run_dir(cfg)
     model, card, training = train(cfg, data, run_dir)
     results = {**evaluate(cfg, data, run_dir, model, card, pairs), "training": training, "versions": versions()}
     write_json(run_dir / "results.json", results)
-    report(results, cfg.method.name, run_dir)
+    report(results, (cfg.method.name, "random"), run_dir)
 
 
 def train(cfg: DictConfig, data: Path, run_dir: Path) -> tuple[LatentWorldModel, ModelCard, dict]:
@@ -78,6 +82,8 @@ def train(cfg: DictConfig, data: Path, run_dir: Path) -> tuple[LatentWorldModel,
     )
     add_hooks(cfg, trainer)
     resumed_at = trainer.step if trainer.resume() else 0
+    if 0 < resumed_at < trainer.total_steps:
+        print(f"continuing {run_dir} after step {resumed_at} of {trainer.total_steps}")
     trainer.train()
     training = {
         "steps": trainer.step,
@@ -115,24 +121,11 @@ def evaluate(
     outcome = evaluate_mpc(policy, pairs, record=settings.record, description="plan", **shared)
     floor = evaluate_mpc(UniformPolicy(card.action_low, card.action_high), pairs, description="random", **shared)
     profile = latent_distance(model, held_out)
-    plot_learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
+    if (run_dir / METRICS).exists():
+        plot_learning_curve(run_dir / METRICS, run_dir / "learning_curve.png")
     plot_latent_distance(profile, run_dir / "latent_distance.png", unit=cfg.env.state_unit)
     save_episodes_gif(outcome, run_dir / "episodes.gif")
     return {cfg.method.name: outcome.summary(), "random": floor.summary(), "latent_distance": profile.summary()}
-
-
-def report(results: dict, method: str, run_dir: Path) -> None:
-    """Prints the numbers a reader asks for first."""
-    print(f"\n{'policy':<10}{'success':>9}{'95 % interval':>18}{'at the end':>12}{'unsolved at start':>19}{'s / plan':>10}")
-    for name in (method, "random"):
-        row = results[name]
-        low, high = row["success_interval"]
-        unsolved = row["success_rate_unsolved_at_start"]  # None where every pair was solved at the start
-        print(
-            f"{name:<10}{row['success_rate']:>9.1%}{f'{low:.1%} - {high:.1%}':>18}{row['success_rate_at_end']:>12.1%}"
-            f"{'-' if unsolved is None else f'{unsolved:.1%}':>19}{row['seconds_per_plan']:>10.2f}"
-        )
-    print(f"{results[method]['pairs']} frozen held-out pairs; results and pictures in {run_dir}")
 
 
 if __name__ == "__main__":

@@ -199,9 +199,10 @@ def check_settings(cfg: DictConfig) -> None:
     Raises:
         ValueError: a setting outside its range, or an unknown choice.
     """
-    model_config(cfg)
     plan_config(cfg.plan)
     get_device(cfg.device)
+    if not cfg.name or Path(cfg.name).name != cfg.name or cfg.name.startswith("."):
+        raise ValueError(f"name={cfg.name!r} must be the plain name of a folder; runs_dir says where that folder goes.")
     if cfg.logger.backend not in ("csv", "wandb", "tensorboard"):
         raise ValueError(f"unknown logger.backend {cfg.logger.backend!r}: choose csv, wandb or tensorboard.")
     model, inverse_model = make_world_model(model_config(cfg), action_dim=1)
@@ -221,9 +222,9 @@ def check_settings(cfg: DictConfig) -> None:
         raise ValueError(f"must be positive: {', '.join(wrong)}.")
     natural = {"seed": cfg.seed, "env.data.seed": cfg.env.data.seed, "evaluation.seed": evaluation.seed}
     natural |= {"collect.num_workers": cfg.collect.num_workers, "optim.weight_decay": optim.weight_decay}
-    wrong = [f"{key}={value}" for key, value in natural.items() if not value >= 0]
+    wrong = [f"{key}={value}" for key, value in natural.items() if not 0 <= value < 2**63]
     if wrong:
-        raise ValueError(f"must not be negative: {', '.join(wrong)}.")
+        raise ValueError(f"must not be negative nor exceed 63 bits: {', '.join(wrong)}.")
     if not 0 <= optim.warmup < 1:
         raise ValueError(f"optim.warmup must lie in [0, 1), got {optim.warmup}.")
     for precision in (optim.precision, cfg.plan.precision):
@@ -231,28 +232,46 @@ def check_settings(cfg: DictConfig) -> None:
     make_env(cfg.env.name, **OmegaConf.to_container(cfg.env.kwargs)).close()
 
 
-def claim_run_dir(cfg: DictConfig) -> Path:
-    """The run's folder, which belongs to one configuration as soon as that one has trained.
+# Settings that change neither the weights nor how they are reached; a finished run may be given others.
+_FREE = ("collect.", "device", "evaluation.", "plan.", "logger.", "env.budget", "env.goal_offset", "env.state_unit")
+
+
+def check_run_dir(cfg: DictConfig) -> Path:
+    """The run's folder, which belongs to one configuration as soon as that one has trained. Writes nothing.
 
     Raises:
         ValueError: it holds a run of another configuration.
-        RuntimeError: another process is at work in it.
     """
     run_dir, ours = Path(cfg.runs_dir) / cfg.name, OmegaConf.to_container(cfg, resolve=True)
     path = run_dir / "config.yaml"
     if path.exists() and ((run_dir / METRICS).exists() or (run_dir / CHECKPOINTS).exists()):
         theirs = OmegaConf.to_container(OmegaConf.load(path))
+        if not isinstance(theirs, dict) or "model" not in theirs:
+            raise ValueError(f"{path} is damaged: restore it, or give another name=...")
+        for config in (ours, theirs):  # a project may be moved, or started from another folder
+            config["data_dir"], config["runs_dir"] = (str(Path(config[key]).resolve()) for key in ("data_dir", "runs_dir"))
         differ = sorted(key for key in _flat(ours) | _flat(theirs) if _flat(ours).get(key) != _flat(theirs).get(key))
-        differ = [key for key in differ if not key.startswith(("collect.", "device", "evaluation.", "plan."))]
+        differ = [key for key in differ if not key.startswith(_FREE)]
         if differ:
             what = ", ".join(f"{key}: {_flat(theirs).get(key)} -> {_flat(ours).get(key)}" for key in differ[:3])
             raise ValueError(f"{run_dir} holds a run of another configuration ({what}): give another name=...")
+    return run_dir
+
+
+def claim_run_dir(cfg: DictConfig) -> Path:
+    """Makes the run's folder, takes it for this process and notes the configuration in it.
+
+    Raises:
+        ValueError: it holds a run of another configuration.
+        RuntimeError: another process is at work in it.
+    """
+    run_dir = check_run_dir(cfg)
     run_dir.mkdir(parents=True, exist_ok=True)
     try:  # held, on the folder itself, until this process ends
         fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         raise RuntimeError(f"another process is at work in {run_dir}: wait for it, or give another name=...") from error
-    write_text(path, OmegaConf.to_yaml(OmegaConf.create(ours)))
+    write_text(run_dir / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
     return run_dir
 
 
@@ -273,6 +292,20 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, values: dict[str, Any]) -> None:
     """Writes a JSON file in one piece."""
     write_text(path, json.dumps(values, indent=2) + "\n")
+
+
+def report(results: dict[str, Any], names: tuple[str, ...], where: Path) -> None:
+    """Prints the numbers a reader asks for first, a row for each policy."""
+    print(f"\n{'policy':<14}{'success':>9}{'95 % interval':>18}{'at the end':>12}{'unsolved at start':>19}{'s / plan':>10}")
+    for name in names:
+        row = results[name]
+        low, high = row["success_interval"]
+        unsolved = row["success_rate_unsolved_at_start"]  # None where every pair was solved at the start
+        print(
+            f"{name:<14}{row['success_rate']:>9.1%}{f'{low:.1%} - {high:.1%}':>18}{row['success_rate_at_end']:>12.1%}"
+            f"{'-' if unsolved is None else f'{unsolved:.1%}':>19}{row['seconds_per_plan']:>10.2f}"
+        )
+    print(f"{results[names[0]]['pairs']} frozen held-out pairs; results and pictures in {where}")
 
 
 def versions() -> dict[str, str]:

@@ -331,3 +331,15 @@ def test_the_index_is_one_plain_json_line_per_episode(record):
 
 if __name__ == "__main__":
     pytest.main([__file__])
+
+
+@pytest.mark.parametrize("lost", ["episodes.jsonl", "state.memmap"])
+def test_a_dataset_that_lost_a_file_is_not_cut_to_nothing(tmp_path, make_episode, meta, lost):
+    """Without its index a dataset would look empty, and a writer would make it so."""
+    with EpisodeWriter(tmp_path, target_episodes=2, meta=meta) as writer:
+        writer.append(make_episode(1))
+    (tmp_path / lost).unlink()
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match=f"has lost {lost}: restore it"):
+        EpisodeWriter(tmp_path, target_episodes=2, meta=meta)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

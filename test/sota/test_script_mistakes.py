@@ -41,7 +41,7 @@ def check(scripts):
         ("+optim.new=1", "no field 'optim.new'"),
         ("~optim.lr", "no field 'optim.lr' to change"),
         ("optim.lr.deeper=1", "no field 'optim.lr.deeper'"),
-        ("method=leWM", "method=leWM is unknown: choose one of ['ficreg', 'lewm']"),
+        ("method=leWM", "method=leWM is unknown: choose one of ['ficreg', 'joint_inverse', 'lewm', 'pldm']"),
         ("env=three_room", "env=three_room is unknown"),
         ("optim.epochs=many", "expected a value like"),
         ("optim.epochs=1.5", "expected a value like"),
@@ -88,14 +88,14 @@ def refused(done, *words):
     [
         (["optim.epochs=0", "optim.lr=-1.0"], "must be positive: optim.epochs=0, optim.lr=-1.0"),
         (["env.data.max_steps=0"], "must be positive: env.data.max_steps=0"),
-        (["seed=-1"], "must not be negative: seed=-1"),
-        (["collect.num_workers=-1"], "must not be negative: collect.num_workers=-1"),
+        (["seed=-1"], "must not be negative nor exceed 63 bits: seed=-1"),
+        (["collect.num_workers=-1"], "must not be negative nor exceed 63 bits: collect.num_workers=-1"),
         (["optim.warmup=2.0"], r"optim.warmup must lie in \[0, 1\)"),
         (["optim.precision=fp16"], "unknown precision 'fp16'"),
         (["env.kwargs.collision=soft"], "collision must be one of"),
         (["plan.num_elites=500"], "num_elites must lie between 2 and num_candidates=300"),
         (["plan.bounds=wide"], "unknown bounds 'wide'"),
-        (["method.context=dead"], "unknown method.context 'dead'"),
+        (["method.context=dead"], "unknown context 'dead'"),
         (["logger.backend=paper"], "unknown logger.backend 'paper'"),
         (["device=quantum"], "device=quantum cannot be used here"),
         (["model.encoder=mlp"], "unknown encoder 'mlp'"),
@@ -157,3 +157,21 @@ def test_a_model_whose_actions_cannot_come_from_the_environment_is_refused(train
     done = execute(tmp_path, "evaluate.py", "checkpoint=wrong.torchrl", f"pairs={trained / RUN / 'pairs.json'}")
     refused(done, "action statistics", "was the model trained for another environment?")
     assert [entry.name for entry in tmp_path.iterdir()] == ["wrong.torchrl"]
+
+
+def test_a_damaged_only_checkpoint_is_not_overwritten(copy, execute, files):
+    """Training again from the start would replace what may still be saved."""
+    (checkpoint,) = (copy / RUN / "checkpoints").iterdir()
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    before = files(copy / RUN / "checkpoints")
+    done = execute(copy, "train.py")
+    assert done.returncode == 1
+    assert "is damaged and there is no other checkpoint" in done.stderr.splitlines()[-1]
+    assert files(copy / RUN / "checkpoints") == before
+
+
+@pytest.mark.parametrize("name", ["name=", "name=../out", "name=.hidden"])
+def test_a_run_stays_below_its_folder(execute, tmp_path, name):
+    done = execute(tmp_path, "train.py", name)
+    assert done.returncode == 1 and "must be the plain name of a folder" in done.stderr
+    assert not list(tmp_path.iterdir())

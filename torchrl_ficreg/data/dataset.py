@@ -114,6 +114,10 @@ class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
         self.split = split
         divide = {"fractions": tuple(split_fractions), "seed": split_seed}
         ids = split_episodes(store.num_episodes, split, **divide)
+        if not len(ids):
+            raise ValueError(
+                f"the {split!r} split of {store.num_episodes} episodes is empty: record more (20 fill every split)."
+            )
         if statistics is None:
             statistics = _measure(store, split_episodes(store.num_episodes, "train", **divide))
         elif statistics.action_dim != store.header.shapes[ACTION][0]:

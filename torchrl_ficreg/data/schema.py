@@ -41,7 +41,8 @@ def check_episode(episode: dict[str, np.ndarray]) -> int:
     """
     expected = {PIXELS: (4, np.uint8), ACTION: (2, np.float32), STATE: (2, np.float64)}
     if set(episode) != set(expected):
-        raise KeyError(f"an episode holds {sorted(expected)}, got {sorted(episode)}: rename or drop the others.")
+        missing, surplus = sorted(set(expected) - set(episode)), sorted(set(episode) - set(expected))
+        raise KeyError(f"an episode holds exactly {sorted(expected)}: missing {missing}, not wanted {surplus}.")
     for key, value in episode.items():
         if not isinstance(value, np.ndarray):
             raise TypeError(f"{key!r} must be a numpy array, got a {type(value).__name__}: convert it before writing.")

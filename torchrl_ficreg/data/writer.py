@@ -90,6 +90,11 @@ class EpisodeWriter:
         self._files: dict[str, int] = {}
         if not resume and (self.path / META_FILE).exists():
             raise FileExistsError(f"{self.path} already holds a dataset: pass resume=True, or another directory.")
+        if (self.path / META_FILE).exists():  # looked for before anything is created, let alone cut
+            lost = [name for name in (INDEX_FILE, *(data_file(self.path, key).name for key in DTYPES))]
+            lost = [name for name in lost if not (self.path / name).exists()]
+            if lost:
+                raise ValueError(f"{self.path} has lost {', '.join(lost)}: restore it, or use another directory.")
         self.path.mkdir(parents=True, exist_ok=True)
         self._index = os.open(self.path / INDEX_FILE, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         try:

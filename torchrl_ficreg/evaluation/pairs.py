@@ -119,7 +119,7 @@ class StartGoalPairs:
             arrays = {name: np.array(content.pop(name)) for name in ("episode", "step", "start_state", "goal_state")}
             pairs = cls(**content, **arrays)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path} is not a manifest of start-goal pairs ({error!r}).") from error
+            raise ValueError(f"{path} is not a manifest of start-goal pairs ({error!r}): move it away to draw new ones.") from error
         if pairs.hash != stored:
             raise ValueError(f"{path} was changed after it was drawn: its hash does not fit. Move it away to draw again.")
         return pairs

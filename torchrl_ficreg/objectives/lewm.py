@@ -90,7 +90,7 @@ class LeWMLoss(LatentLoss):
         return self._reduce(squared_error(predicted, latent[..., 1:, :]).mean(-1), clip.mask)
 
     def _spread(self, clip: Clip, latent: torch.Tensor) -> torch.Tensor:
-        """SIGReg of the latents [B, T, D] that count."""
+        """The regulariser on the latents [B, T, D] that count."""
         mask = clip.frame_mask  # [B, T] or None
         mask = mask if mask is None else mask.flatten(0, -2).transpose(0, 1)  # [T, B]
         return self.sigreg(latent.flatten(0, -3).transpose(0, 1), mask)  # [T, B, D]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torchrl import torchrl_logger
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 from torchrl.objectives.common import LossModule
 from torchrl.record.loggers import Logger
@@ -135,6 +136,7 @@ class OfflineTrainer(Trainer):
             ValueError: the checkpoint is damaged, or belongs to other networks, data or hooks.
         """
         latest = None if self.checkpoint_rotation is None else self.checkpoint_rotation.latest()
+        self._look_for_damage()
         if latest is not None:
             try:
                 self.checkpoint_rotation.load_latest(self._sync_checkpoint_components())
@@ -153,6 +155,35 @@ class OfflineTrainer(Trainer):
         self._sweep()
         self.metrics_table.drop_after(self.step)
         return latest is not None
+
+    def _look_for_damage(self) -> None:
+        """Warns of damaged checkpoints; refuses where they are all there is, for a new run would overwrite them."""
+        if self.checkpoint_rotation is None:
+            return
+        whole = self.checkpoint_rotation.checkpoints()
+        for path in sorted(self.checkpoint_rotation.directory.glob(f"{self.checkpoint_rotation.prefix}-*")):
+            if path not in whole and not whole:
+                raise ValueError(f"{path} is damaged and there is no other checkpoint: move it away to begin again.")
+            if path not in whole:
+                torchrl_logger.warning(f"{path} is damaged: continuing from {whole[-1]}.")
+
+    def save_trainer(self, force_save: bool = False) -> None:
+        """Saves when one is due.
+
+        Raises:
+            OSError: the disk has no room for it. The checkpoints already there stay as they are.
+        """
+        if self.checkpoint_rotation is not None:
+            self.checkpoint_rotation.directory.mkdir(parents=True, exist_ok=True)
+            # Weights twice, two moments; staged, then packed. A disk that fills up under a memory map cannot be caught.
+            need = 2 * 4 * sum(p.numel() * p.element_size() for p in self.loss_module.parameters())
+            free = shutil.disk_usage(self.checkpoint_rotation.directory).free
+            if free < need:
+                raise OSError(
+                    f"no room for a checkpoint in {self.checkpoint_rotation.directory}: {free / 1e6:.0f} MB are free, "
+                    f"{need / 1e6:.0f} MB needed. Make room; the same command continues from the last checkpoint."
+                )
+        super().save_trainer(force_save)
 
     def _sweep(self) -> None:
         """Removes what a killed process left half-written beside its checkpoints."""

@@ -25,7 +25,7 @@ def main(name: str, pattern: str) -> None:
     runs, pooled, hashes = {}, {}, set()
     for file in sorted(glob.glob(pattern)):
         result = json.loads(Path(file).read_text())
-        method = next(key for key in result if key in ("ficreg", "lewm"))
+        method = next(key for key in result if key in ("ficreg", "lewm", "joint_inverse", "pldm"))
         outcome = result[method]
         hashes.add(outcome["pairs_hash"])
         runs[Path(file).parent.name] = {key: outcome[key] for key in KEPT} | {

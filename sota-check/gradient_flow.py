@@ -1,4 +1,4 @@
-"""Measures who receives gradient from which term of FICReg, and draws it: docs/results/gradient_flow.{json,png}."""
+"""Measures who receives gradient from which term of every loss: docs/results/gradient_flow.{json,png} and a table."""
 
 from __future__ import annotations
 
@@ -9,45 +9,104 @@ import matplotlib
 import torch
 from tensordict import TensorDict
 
-from torchrl_ficreg import FICRegLoss, gradient_flow, make_world_model, ModelConfig
+from torchrl_ficreg import FICRegLoss, gradient_flow, InverseDynamicsModel, LeWMLoss, make_world_model, ModelConfig
+from torchrl_ficreg.objectives import JointInverseLoss, PLDMLoss
 
-RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+NETWORKS = ("encoder", "predictor", "inverse_model")
+HISTORY, BLOCK = 3, 10  # latents the predictor sees; width of an action block
+
+# title: class, kind of inverse model, arguments
+LOSSES = {
+    "LeWMLoss": (LeWMLoss, None, {}),
+    'FICRegLoss, context="detached"': (FICRegLoss, "mlp", {}),
+    'FICRegLoss, context="live"': (FICRegLoss, "mlp", {"context": "live"}),
+    'FICRegLoss, consistency="trusted"': (FICRegLoss, "mlp", {"consistency": "trusted"}),
+    'FICRegLoss, consistency="nll"': (FICRegLoss, "gaussian", {"consistency": "nll"}),
+    'FICRegLoss, consistency_target="judge"': (FICRegLoss, "mlp", {"consistency_target": "judge"}),
+    "FICRegLoss, consistency_steps=2": (FICRegLoss, "mlp", {"consistency_steps": 2}),
+    "FICRegLoss, ensemble of judges": (FICRegLoss, "ensemble", {}),
+    "FICRegLoss, transformer as judge": (FICRegLoss, "transformer", {}),
+    "JointInverseLoss": (JointInverseLoss, "mlp", {}),
+    "JointInverseLoss, sigreg_coeff=0": (JointInverseLoss, "mlp", {"sigreg_coeff": 0.0}),
+    "PLDMLoss": (PLDMLoss, "mlp", {"cov_t_coeff": 1.0}),
+}
 
 
 def main() -> None:
-    """Measures both contexts on one random clip batch."""
-    tables = {}
-    for context in ("detached", "live"):
-        torch.manual_seed(0)
-        model, inverse_model = make_world_model(ModelConfig.preset("cpu", history=3), action_dim=2)
-        for block in model.predictor.module.blocks:  # away from AdaLN-zero, whose first step passes nothing on
-            torch.nn.init.normal_(block.to_modulation.weight, std=0.1)
-        loss = FICRegLoss(model.encoder, model.predictor, inverse_model, context=context)
-        pixels = torch.randint(0, 256, (32, 4, 3, 64, 64), dtype=torch.uint8)
-        tables[context] = gradient_flow(loss, TensorDict({"pixels": pixels, "action": torch.randn(32, 4, 10)}, [32, 4]))
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / "gradient_flow.json").write_text(json.dumps(tables, indent=2) + "\n")
-    draw(tables, RESULTS / "gradient_flow.png")
+    """Measures every loss on one random clip batch."""
+    torch.set_num_threads(1)  # the same digits on every machine with the same kernels
+    tables = {title: measure(*entry) for title, entry in LOSSES.items()}
+    (DOCS / "results").mkdir(parents=True, exist_ok=True)
+    (DOCS / "results" / "gradient_flow.json").write_text(json.dumps(tables, indent=2) + "\n")
+    (DOCS / "source" / "gradient_flow.rst").write_text(tabulate(tables))
+    draw(tables, DOCS / "results" / "gradient_flow.png")
+
+
+def measure(make: type, kind: str | None, arguments: dict) -> dict[str, dict[str, float]]:
+    """``{term: {network: norm}}`` of a loss around new networks, always the same ones."""
+    torch.manual_seed(0)
+    config = ModelConfig.preset("cpu", history=HISTORY)
+    model, _ = make_world_model(config, action_dim=2)
+    for block in model.predictor.module.blocks:  # away from AdaLN-zero, whose first step passes nothing on
+        torch.nn.init.normal_(block.to_modulation.weight, std=0.1)
+    pixels = torch.randint(0, 256, (32, HISTORY + 1, 3, 64, 64), dtype=torch.uint8)
+    action = torch.randn(32, HISTORY + 1, BLOCK)
+    networks = [model.encoder, model.predictor]
+    if kind is not None:
+        history = {"history": HISTORY} if kind == "transformer" else {}
+        networks.append(InverseDynamicsModel(config.latent_dim, BLOCK, config.inverse_hidden_dim, kind=kind, **history))
+    torch.manual_seed(1)  # the same dropout, however many numbers the inverse model took
+    clip = TensorDict({"pixels": pixels, "action": action}, action.shape[:2])
+    return gradient_flow(make(*networks, **arguments), clip)
+
+
+def tabulate(tables: dict[str, dict[str, dict[str, float]]]) -> str:
+    """The tables as one list-table of reStructuredText; exact zeros are 0."""
+    lines = [
+        ".. Written by sota-check/gradient_flow.py.",
+        "",
+        ".. list-table:: Gradient norm of every term at every network; 0 is exact",
+        "   :header-rows: 1",
+        "",
+        "   * - loss",
+        "     - term",
+        *(f"     - {name.replace('_', ' ')}" for name in NETWORKS),
+    ]
+    for title, table in tables.items():
+        for number, (term, row) in enumerate(table.items()):
+            lines += [f"   * - {f'``{title}``' if number == 0 else ''}".rstrip(), f"     - ``{term}``"]
+            lines += [f"     - {number_of(row[name]) if name in row else ''}".rstrip() for name in NETWORKS]
+    return "\n".join(lines) + "\n"
+
+
+def number_of(norm: float) -> str:
+    """Two digits, or 0 where nothing arrives."""
+    return "0" if norm == 0 else f"{norm:.2g}"
 
 
 def draw(tables: dict[str, dict[str, dict[str, float]]], target: Path) -> None:
-    """One table per context; zeros are blank on white, norms shaded by their logarithm."""
+    """One picture per loss; zeros are on white, norms shaded by their logarithm."""
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, len(tables), figsize=(5.2 * len(tables), 2.6))
-    for axis, (context, table) in zip(axes, tables.items()):
-        networks = list(next(iter(table.values())))
+    columns = 3
+    rows = -(-len(tables) // columns)
+    figure, axes = pyplot.subplots(rows, columns, figsize=(5.2 * columns, 2.7 * rows), squeeze=False)
+    for axis in axes.flat[len(tables) :]:
+        axis.set_axis_off()
+    for axis, (title, table) in zip(axes.flat, tables.items()):
+        networks = [name for name in NETWORKS if name in next(iter(table.values()))]
         values = torch.tensor([[row[name] for name in networks] for row in table.values()])
-        axis.imshow(values.clamp_min(1e-5).log10(), cmap="Greens", vmin=-5, vmax=1.5, aspect="auto")
+        axis.imshow(values.clamp_min(1e-5).log10(), cmap="Greens", vmin=-5, vmax=3, aspect="auto")
         for i, j in torch.cartesian_prod(torch.arange(len(table)), torch.arange(len(networks))).tolist():
-            text = "0" if values[i, j] == 0 else f"{values[i, j]:.2g}"
-            axis.text(j, i, text, ha="center", va="center")
+            axis.text(j, i, number_of(values[i, j].item()), ha="center", va="center")
         axis.set_xticks(range(len(networks)), [name.replace("_", " ") for name in networks])
         axis.set_yticks(range(len(table)), list(table))
-        axis.set_title(f'context="{context}"')
+        axis.set_title(title, fontsize=10)
     figure.tight_layout()
-    figure.savefig(target, dpi=120)
+    figure.savefig(target, dpi=100)
+    pyplot.close(figure)
 
 
 if __name__ == "__main__":

@@ -5,5 +5,6 @@ author = "The torchrl_ficreg authors"
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
+exclude_patterns = ["gradient_flow.rst"]  # included by nutshell.rst
 html_theme = "alabaster"
 nitpicky = False

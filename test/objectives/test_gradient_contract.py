@@ -22,6 +22,7 @@ PRECISIONS = {"fp32": contextlib.nullcontext, "bf16": lambda: torch.autocast("cp
 def step(loss, clip, seed=3, precision="fp32", terms=None):
     """Gradients of the sum of the terms (all of them by default), without touching a parameter."""
     loss.zero_grad()
+    loss.sigreg.generator_state[1] = 0
     torch.manual_seed(seed)
     with PRECISIONS[precision]():
         output = loss(clip)

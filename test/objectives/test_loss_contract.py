@@ -16,12 +16,14 @@ from torchrl_ficreg import CausalPredictor, ConvEncoder, FICRegLoss, InverseDyna
 
 def values(loss, *args, **kwargs):
     torch.manual_seed(0)
+    if hasattr(loss, "sigreg"):
+        loss.sigreg.generator_state[1] = 0
     return loss(*args, **kwargs)
 
 
-@pytest.fixture(params=["lewm", "ficreg"])
-def loss(request, make_lewm, make_ficreg):
-    return {"lewm": make_lewm, "ficreg": make_ficreg}[request.param]()
+@pytest.fixture(params=["lewm", "paper", "joint", "pldm"])
+def loss(request, make_loss):
+    return make_loss(request.param)
 
 
 def test_building_a_loss_warns_of_nothing(networks):
@@ -75,6 +77,17 @@ def test_networks_keep_their_own_key_names(make_ficreg, make_clip):
         sigreg=SIGReg(16),
     )
     torch.testing.assert_close(values(loss, clip), values(reference, clip))
+
+
+def _Narrow(in_keys, out_keys, keep=1):
+    """A module that keeps so many dimensions of its first input, the last of them 1 wide, for each output."""
+
+    class Narrow(nn.Module):
+        def forward(self, *inputs):
+            value = inputs[0].float().flatten(keep - 1 if keep > 1 else 0)[..., :1]
+            return (value,) * len(out_keys) if len(out_keys) > 1 else value
+
+    return TensorDictModule(Narrow(), list(in_keys), list(out_keys))
 
 
 class _Add(nn.Linear):
@@ -209,6 +222,12 @@ def test_an_error_inside_leaves_the_networks_usable(networks, make_clip, failing
         (lambda c: c.set("mask", torch.ones(8, 3, 1) > 0), ValueError, r"expected \[8, 3\] bool, got \[8, 3, 1\]"),
         (lambda c: TensorDict({**c, "mask": torch.ones(8, 1, dtype=torch.bool)}, [8]), ValueError, r"got \[8, 1\]"),
         (lambda c: c.set("mask", torch.ones(8, 3)), ValueError, "got .* torch.float32"),
+        (lambda c: c.set("mask", torch.zeros(8, 3) > 0), ValueError, "the mask leaves no transition"),
+        (lambda c: c.set("mask", torch.arange(3).expand(8, 3) > 1), ValueError, "the mask leaves no transition"),
+        (lambda c: _poison(c, torch.nan), ValueError, "1 of 16 action blocks hold a NaN or an infinity"),
+        (lambda c: _poison(c, torch.inf), ValueError, "1 of 16 action blocks hold a NaN or an infinity"),
+        (lambda c: c[:0], ValueError, "the batch of clips is empty"),
+        (lambda c: c[:1], ValueError, "B >= 2|at least 2 clips"),
     ],
 )
 def test_a_wrong_clip_is_refused_and_a_right_one_taken_afterwards(loss, make_clip, change, error, message):
@@ -216,6 +235,60 @@ def test_a_wrong_clip_is_refused_and_a_right_one_taken_afterwards(loss, make_cli
         loss(change(make_clip()))
     sum(loss(make_clip()).values()).backward()
     assert all(param.grad is not None for param in loss.parameters())
+
+
+def _poison(clip, value):
+    clip["action"][3, 1, 0] = value
+    return clip
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"encoder": _Narrow(("pixels",), ("latent",), keep=2)}, ValueError, "the encoder must map pixels"),
+        (
+            {"encoder": _Narrow(("pixels",), ("latent",), keep=5)},
+            ValueError,
+            r"the encoder must map pixels \[B, T, 3, H, W\]",
+        ),
+        (
+            {"predictor": _Narrow(("latent", "action"), ("predicted_latent",), keep=3)},
+            ValueError,
+            r"the shape of its target, got \[8, 2, 1\] for \[8, 2, 6\]",
+        ),
+        (
+            {"inverse_model": _Narrow(("latent", "after"), ("recovered_action",), keep=3)},
+            ValueError,
+            r"the shape of its target, got \[8, 2, 1\] for \[8, 2, 6\]",
+        ),
+    ],
+)
+def test_networks_of_the_wrong_width_are_refused_and_never_broadcast(networks, make_clip, change, error, message):
+    parts = dict(zip(FICRegLoss._networks, networks())) | change
+    with pytest.raises(error, match=message):
+        FICRegLoss(**parts, sigreg=SIGReg(4))(make_clip())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"encoder": _Narrow(("pixels", "action"), ("latent",))}, "the encoder must read 1 entries, it reads"),
+        ({"predictor": _Narrow(("latent",), ("predicted_latent",))}, "the predictor must read 2 entries, it reads"),
+        ({"inverse_model": _Narrow(("latent",), ("a",))}, "the inverse_model must read 2 entries, it reads"),
+        ({"encoder": _Narrow(("pixels",), ("code", "skip"))}, "the encoder writes .* and none is 'latent': rename"),
+    ],
+)
+def test_networks_whose_keys_do_not_fit_are_refused(networks, change, message):
+    with pytest.raises(ValueError, match=message):
+        FICRegLoss(**dict(zip(FICRegLoss._networks, networks())) | change)
+
+
+def test_a_key_that_no_network_writes_is_named_at_the_first_call(networks, make_clip):
+    encoder, predictor, _ = networks()
+    loss = FICRegLoss(encoder, predictor, InverseDynamicsModel(6, 6, 8, kind="gaussian"), sigreg=SIGReg(4))
+    loss.set_keys(recovered_action="guess")
+    with pytest.raises(KeyError, match="no 'guess' among .*'recovered_action'.*: see loss.set_keys"):
+        loss(make_clip())
 
 
 def test_a_mask_of_another_shape_is_not_broadcast_into_an_empty_loss(make_ficreg, make_clip):
@@ -227,7 +300,7 @@ def test_a_mask_of_another_shape_is_not_broadcast_into_an_empty_loss(make_ficreg
 
 
 def test_unknown_choices_are_refused(networks):
-    with pytest.raises(ValueError, match="unknown context 'dead': choose 'detached' or 'live'"):
+    with pytest.raises(ValueError, match="unknown context 'dead': choose one of 'detached', 'live'"):
         FICRegLoss(*networks(), context="dead")
     for build in (lambda: LeWMLoss(*networks()[:2], reduction="max"), lambda: FICRegLoss(*networks(), reduction="max")):
         with pytest.raises(ValueError, match="unknown reduction 'max': choose 'mean', 'sum' or 'none'"):

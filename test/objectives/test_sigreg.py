@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from torchrl_ficreg import SIGReg
+from torchrl_ficreg.objectives.sigreg import standard_normal
 
 # Both expectations are Gaussian integrals over [-3, 3]: of (1 - exp(-t^2)) exp(-t^2 / 2), the variance of the empirical
 # characteristic function, and of (1 - exp(-t^2 / 2))^2 exp(-t^2 / 2).
@@ -18,10 +19,13 @@ AT_COLLAPSE = (
 )
 
 
-def textbook(latent: torch.Tensor, num_directions: int) -> torch.Tensor:
-    """B times the integral, one sine and one cosine per knot; takes the directions SIGReg would draw."""
-    directions = torch.randn(latent.shape[-1], num_directions).to(latent)  # [D, M]
-    projected = latent @ (directions / directions.norm(dim=0))  # [T, B, M]
+def noise(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def textbook(latent: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+    """B times the integral, one sine and one cosine per knot."""
+    projected = latent @ directions.to(latent)  # [T, B, M]
     knots = torch.linspace(0, 3, 17).to(latent)
     angle = projected.unsqueeze(-1) * knots  # [T, B, M, 17]
     gaussian = torch.exp(-knots.square() / 2)
@@ -29,18 +33,29 @@ def textbook(latent: torch.Tensor, num_directions: int) -> torch.Tensor:
     return latent.shape[-2] * 2 * torch.trapezoid(error * gaussian, knots).mean()
 
 
-def seeded(function, latent, *args):
-    torch.manual_seed(1)
+def directions_of(sigreg: SIGReg, dim: int) -> torch.Tensor:
+    """Those of the next call, [D, M]; none is used up."""
+    training = sigreg.training
+    directions = sigreg.eval()._draw(dim)
+    sigreg.train(training)
+    return directions
+
+
+def with_gradient(function, latent, *args):
     latent = latent.detach().requires_grad_()
     value = function(latent, *args)
-    return value, torch.autograd.grad(value, latent)[0]
+    return value.detach(), torch.autograd.grad(value, latent)[0]
 
 
-@pytest.mark.parametrize(("batch", "num_directions"), [(32, 1024), (128, 1024), (1024, 256), (4096, 128)])
-def test_it_is_1_05_on_a_gaussian_at_any_batch_size(batch, num_directions):
-    torch.manual_seed(0)
+# The numbers
+
+
+@pytest.mark.parametrize("batch", [32, 128, 1024, 4096])
+def test_it_is_1_05_on_a_gaussian_at_any_batch_size(batch):
+    """1.05 ± 0.1, with enough dimensions for the directions to be nearly independent."""
     assert ON_GAUSSIAN == pytest.approx(1.05, abs=0.005)
-    assert SIGReg(num_directions)(torch.randn(4, batch, 64)).item() == pytest.approx(ON_GAUSSIAN, abs=0.1)
+    value = SIGReg(1024 if batch < 1024 else 256)(noise(4, batch, 192))
+    assert value.item() == pytest.approx(ON_GAUSSIAN, abs=0.1)
 
 
 @pytest.mark.parametrize("batch", [2, 128])
@@ -52,58 +67,32 @@ def test_it_is_0_402_per_row_at_collapse(batch):
 @pytest.mark.parametrize("shape", [(1, 4, 3), (3, 32, 6), (2, 128, 16)])
 @pytest.mark.parametrize("scale", [0.1, 1.0, 3.0])
 def test_it_equals_the_textbook_formulation_in_value_and_gradient(shape, scale):
-    """Angle addition and Horner's rule lose less than 1e-5 against sines and cosines in float64."""
-    latent = scale * torch.randn(shape, generator=torch.Generator().manual_seed(0))
-    value, gradient = seeded(SIGReg(32), latent)
-    expected, expected_gradient = seeded(textbook, latent.double(), 32)
+    """Powers and Horner's rule lose less than 1e-5 against sines and cosines in float64."""
+    latent, sigreg = scale * noise(*shape), SIGReg(32)
+    expected, expected_gradient = with_gradient(textbook, latent.double(), directions_of(sigreg, shape[-1]))
+    value, gradient = with_gradient(sigreg, latent)
     assert value.item() == pytest.approx(expected.item(), rel=1e-5)
     assert (gradient - expected_gradient).norm() <= 1e-5 * expected_gradient.norm()
 
 
 def test_the_settings_are_those_of_the_integral():
-    """More directions, knots and a longer interval: the statistic of one row at z is a known integral too."""
+    """More knots and a longer interval: the statistic of one row at z is a known integral too."""
     # For B = 1 point z doubled, |phi - g|^2 = 1 - 2 g cos(tz) + g^2; D = 1 leaves the direction's sign only.
     z = torch.full((2, 1), 0.7)
     expected = 2 * ROOT * (1 - 2 / 2**0.5 * math.exp(-(0.7**2) / 4) + 1 / 3**0.5)
     assert SIGReg(1, num_knots=65, max_knot=8.0)(z).item() == pytest.approx(expected, rel=1e-4)
 
 
-def test_the_order_of_the_batch_does_not_matter():
-    latent = torch.randn(2, 64, 8)
-    value, gradient = seeded(SIGReg(16), latent)
-    order = torch.randperm(64)
-    shuffled, shuffled_gradient = seeded(SIGReg(16), latent[:, order])
-    torch.testing.assert_close(shuffled, value)
-    torch.testing.assert_close(shuffled_gradient, gradient[:, order], rtol=1e-4, atol=1e-6)
-
-
-def test_time_steps_are_judged_apart_and_averaged():
-    latent = torch.randn(3, 16, 4)
-    single = [seeded(SIGReg(16), row)[0] for row in latent]
-    torch.testing.assert_close(seeded(SIGReg(16), latent)[0], torch.stack(single).mean())
-
-
-def test_directions_are_drawn_anew_at_every_call():
-    sigreg, latent = SIGReg(2), torch.randn(8, 4)
-    assert sigreg(latent) != sigreg(latent)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_it_computes_in_float32_inside_autocast(dtype):
-    latent = torch.randn(2, 16, 4).to(dtype)
-    expected, gradient = seeded(SIGReg(16), latent.float())
-    torch.manual_seed(1)
-    latent.requires_grad_()
-    with torch.autocast("cpu", torch.bfloat16):
-        value = SIGReg(16)(latent)
-    assert value.dtype == torch.float32
-    assert value.equal(expected)
-    assert torch.autograd.grad(value, latent)[0].equal(gradient.to(dtype))
+@pytest.mark.parametrize("masked", [False, True])
+def test_gradcheck(masked):
+    latent = noise(2, 5, 3, dtype=torch.float64).requires_grad_()
+    mask = (torch.arange(10).view(2, 5) % 4 > 0) if masked else None
+    sigreg = SIGReg(4).eval()
+    assert torch.autograd.gradcheck(lambda value: sigreg(value, mask), latent)
 
 
 def test_it_pulls_a_collapsed_batch_apart():
-    torch.manual_seed(0)
-    latent = (0.01 * torch.randn(64, 2)).requires_grad_()
+    latent = (0.01 * noise(64, 2)).requires_grad_()
     optimizer, sigreg = torch.optim.Adam([latent], 0.05), SIGReg(16)
     for _ in range(200):
         optimizer.zero_grad()
@@ -114,13 +103,194 @@ def test_it_pulls_a_collapsed_batch_apart():
 
 
 def test_it_offers_no_second_derivative_rather_than_a_wrong_one():
-    latent = torch.randn(8, 3, requires_grad=True)
+    latent = noise(8, 3).requires_grad_()
     (gradient,) = torch.autograd.grad(SIGReg(4)(latent), latent, create_graph=True)
     assert not gradient.requires_grad
 
 
-def test_it_holds_no_state():
-    assert not SIGReg().state_dict()
+# What it does not depend on
+
+
+def test_the_order_of_the_batch_does_not_matter():
+    """In exact arithmetic; in float64, to 1e-12."""
+    latent, order = noise(2, 64, 8, dtype=torch.float64), torch.randperm(64, generator=torch.Generator().manual_seed(1))
+    value, gradient = with_gradient(SIGReg(16), latent)
+    shuffled, shuffled_gradient = with_gradient(SIGReg(16), latent[:, order])
+    torch.testing.assert_close(shuffled, value, rtol=1e-12, atol=0)
+    torch.testing.assert_close(shuffled_gradient, gradient[:, order], rtol=0, atol=1e-13)
+
+
+def test_a_rotation_does_not_matter_in_distribution():
+    """Far from Gaussian, one dimension wide and three narrow: mean and spread over 400 draws stay the same."""
+    latent = noise(64, 4) * torch.tensor([3.0, 0.3, 0.3, 0.3])
+    rotation = torch.linalg.qr(noise(4, 4, seed=1))[0]
+    straight, rotated = SIGReg(16), SIGReg(16, seed=1)
+    values = torch.tensor([[straight(latent), rotated(latent @ rotation)] for _ in range(400)])  # [400, 2]
+    error = (values.var(0).sum() / len(values)).sqrt()
+    assert (values[:, 0].mean() - values[:, 1].mean()).abs() < 4 * error
+    assert values[:, 0].std().item() == pytest.approx(values[:, 1].std().item(), rel=0.2)
+
+
+def test_time_steps_are_judged_apart_and_averaged():
+    latent = noise(3, 16, 4)
+    single = [SIGReg(16)(row) for row in latent]
+    torch.testing.assert_close(SIGReg(16)(latent), torch.stack(single).mean())
+
+
+def test_batch_time_judges_all_latents_together():
+    latent = noise(3, 16, 4)
+    together = SIGReg(16, unit="batch_time")(latent)
+    torch.testing.assert_close(together, SIGReg(16)(latent.flatten(0, 1)))
+    assert not together.isclose(SIGReg(16)(latent))
+
+
+# Masks
+
+
+@pytest.mark.parametrize("unit", ["time", "batch_time"])
+@pytest.mark.parametrize("poison", [math.nan, math.inf, 1e30])
+def test_masked_latents_contribute_nothing_whatever_they_hold(unit, poison):
+    """The statistic of the selected rows, and no gradient for the others."""
+    latent, mask = noise(2, 16, 4), noise(2, 16, seed=1) > -0.3
+    sigreg = SIGReg(16, unit=unit).eval()
+    rows = [row[kept] for row, kept in zip(latent, mask)] if unit == "time" else [latent[mask]]
+    value, gradient = with_gradient(sigreg, torch.where(mask.unsqueeze(-1), latent, poison), mask)
+    expected = [with_gradient(sigreg, row) for row in rows]
+    torch.testing.assert_close(value, torch.stack([each for each, _ in expected]).mean())
+    torch.testing.assert_close(gradient[mask], torch.cat([grad / len(rows) for _, grad in expected]))
+    assert (gradient[~mask] == 0).all()
+
+
+def test_a_mask_of_ones_changes_nothing_and_one_of_zeros_gives_zero():
+    latent, ones = noise(2, 8, 4), torch.ones(2, 8, dtype=torch.bool)
+    assert SIGReg(16)(latent, ones).equal(SIGReg(16)(latent))
+    value, gradient = with_gradient(SIGReg(16), latent, ~ones)
+    assert value == 0
+    assert (gradient == 0).all()
+
+
+# Directions and their state
+
+
+def test_directions_are_drawn_anew_at_every_call_in_train_mode_only():
+    sigreg, latent = SIGReg(2), noise(8, 4)
+    first, second = sigreg(latent), sigreg(latent)
+    assert first != second
+    sigreg.eval()
+    state = sigreg.generator_state.clone()
+    third = sigreg(latent)
+    assert third.equal(sigreg(latent))
+    assert sigreg.generator_state.equal(state)
+    assert sigreg.train()(latent).equal(third)  # looked at before, used now
+    assert sigreg.generator_state.tolist() == [0, 3]
+
+
+def test_the_state_travels_with_checkpoints():
+    one, other, latent = SIGReg(4, seed=7), SIGReg(4), noise(8, 4)
+    one(latent)
+    assert list(one.state_dict()) == ["generator_state"]
+    other.load_state_dict(one.state_dict())
+    assert other.generator_state.tolist() == [7, 1]
+    assert [one(latent).item() for _ in range(3)] == [other(latent).item() for _ in range(3)]
+
+
+def test_seeds_differ_and_the_global_random_state_takes_no_part():
+    latent = noise(8, 4)
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    values = [SIGReg(4, seed=seed)(latent).item() for seed in (0, 1, 2, -1, 2**40)]
+    assert len(set(values)) == 5
+    assert torch.get_rng_state().equal(before)
+    torch.manual_seed(1)
+    assert SIGReg(4)(latent).item() == values[0]
+
+
+def test_directions_are_unit_vectors_even_in_few_dimensions():
+    for dim in (1, 2, 192):
+        directions = SIGReg(1000)._draw(dim)
+        torch.testing.assert_close(directions.norm(dim=0), torch.ones(1000))
+
+
+def test_no_radius_is_zero_or_infinite():
+    """The extreme words of the generator: 0 / 0 in one or two dimensions would end a run after thousands of steps."""
+    uniform = (torch.tensor([0, 2**23 - 1]).float() + 0.5) / 2**23
+    radius = (-2 * uniform.log()).sqrt()
+    assert (radius > 0).all()
+    assert radius.isfinite().all()
+    draws = torch.cat([standard_normal(torch.tensor([0, draw]), 2**20) for draw in range(8)])
+    pairs = draws.view(8, 2, -1)  # the two halves of a draw share radii
+    assert pairs.square().sum(1).min() > 0
+    assert draws.abs().max() < math.sqrt(2 * 24 * math.log(2))
+
+
+def test_the_numbers_are_standard_normal():
+    """Moments of 2^20 numbers within 5 standard errors; cumulative distribution against erf."""
+    draws = standard_normal(torch.tensor([3, 5]), 2**20).double()
+    error = 5 / 2**10
+    for power, moment, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96), (6, 15, 10170)):
+        assert draws.pow(power).mean().item() == pytest.approx(moment, abs=error * variance**0.5)
+    for point in (-3.0, -1.0, 0.0, 0.5, 2.0):
+        expected = 0.5 * (1 + math.erf(point / 2**0.5))
+        assert (draws < point).double().mean().item() == pytest.approx(expected, abs=error / 2)
+
+
+def test_neighbouring_positions_draws_and_seeds_are_uncorrelated():
+    def draw(seed, number):
+        return standard_normal(torch.tensor([seed, number]), 2**18).double()
+
+    base = draw(0, 0)
+    others = {"draw": draw(0, 1), "seed": draw(1, 0), "swap": draw(1, 1), "far": draw(0, 10**6)}
+    others |= {f"shift {by}": base.roll(by) for by in (1, 2, 192, 1024, 2**17)}
+    for name, other in others.items():
+        assert abs((base * other).mean().item()) < 5 / 2**9, name
+        assert abs((base.square() * other.square()).mean().item() - 1) < 5 * 8**0.5 / 2**9, name
+    assert not draw(1, 0).equal(draw(0, 1))
+
+
+def test_one_state_gives_one_sequence_of_any_length_of_state_only():
+    state = torch.tensor([3, 5])
+    assert standard_normal(state, 10).equal(standard_normal(state, 10))
+    assert len(standard_normal(state, 7)) == 7
+    assert state.tolist() == [3, 5]
+
+
+# Precision and compilation
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_it_computes_in_float32_inside_autocast(dtype):
+    latent = noise(2, 16, 4).to(dtype).requires_grad_()
+    expected, gradient = with_gradient(SIGReg(16), latent.float())
+    with torch.autocast("cpu", torch.bfloat16):
+        value = SIGReg(16)(latent)
+    assert value.dtype == torch.float32
+    assert value.equal(expected)
+    assert torch.autograd.grad(value, latent)[0].equal(gradient.to(dtype))
+
+
+def test_a_module_in_half_precision_draws_the_same_directions():
+    latent = noise(2, 16, 4)
+    half = SIGReg(16).to(torch.bfloat16)
+    assert half.generator_state.dtype == torch.int64
+    assert half(latent).equal(SIGReg(16)(latent))
+    assert half(latent.bfloat16()).isfinite()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_it_compiles_into_one_graph_that_draws_the_same_directions(masked):
+    latent, mask = noise(2, 16, 4), (noise(2, 16, seed=1) > 0 if masked else None)
+    eager, graph = SIGReg(16), SIGReg(16)
+    torch._dynamo.reset()
+    compiled = torch.compile(graph, fullgraph=True, backend="aot_eager")
+    for _ in range(3):
+        expected, gradient = with_gradient(eager, latent, mask)
+        value, ours = with_gradient(compiled, latent, mask)
+        torch.testing.assert_close(value, expected, rtol=1e-6, atol=0)
+        torch.testing.assert_close(ours, gradient, rtol=1e-5, atol=1e-7)
+    assert graph.generator_state.equal(eager.generator_state)
+
+
+# Mistakes
 
 
 @pytest.mark.parametrize("shape", [(4,), (1, 4), (2, 1, 4), (2, 2, 2, 4)])
@@ -129,7 +299,22 @@ def test_latents_of_another_shape_are_refused(shape):
         SIGReg(4)(torch.zeros(shape))
 
 
-@pytest.mark.parametrize("wrong", [{"num_directions": 0}, {"num_knots": 1}, {"max_knot": 0.0}])
+@pytest.mark.parametrize(
+    "mask", [torch.ones(2, 8), torch.ones(8, dtype=torch.bool), torch.ones(2, 8, 1, dtype=torch.bool)]
+)
+def test_masks_of_another_shape_or_kind_are_refused(mask):
+    with pytest.raises(ValueError, match=r"the mask must be \[2, 8\] bool, got"):
+        SIGReg(4)(torch.zeros(2, 8, 3), mask)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"num_directions": 0}, {"num_knots": 1}, *({"max_knot": value} for value in (0.0, math.nan, math.inf))]
+)
 def test_impossible_settings_are_refused(wrong):
     with pytest.raises(ValueError, match="num_directions >= 1, num_knots >= 2 and max_knot > 0"):
         SIGReg(**wrong)
+
+
+def test_an_unknown_unit_is_refused():
+    with pytest.raises(ValueError, match="unknown unit 'step': choose 'time' or 'batch_time'"):
+        SIGReg(unit="step")

@@ -17,9 +17,14 @@ class GlobalBatchNorm1d(nn.BatchNorm1d):
     """
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """[N, C] -> [N, C]."""
-        if not (self.training and dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1):
+        """[N, C] -> [N, C], or [N, C, L] -> [N, C, L]."""
+        measures = self.training or self.running_mean is None
+        if not (measures and dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1):
             return super().forward(x)
+        self._check_input_dim(x)
+        if x.ndim == 3:
+            rows = self._forward_global(x.transpose(1, 2).flatten(0, 1))  # [N * L, C]
+            return rows.unflatten(0, (len(x), -1)).transpose(1, 2)
         return self._forward_global(x)
 
     def _forward_global(self, x: torch.Tensor) -> torch.Tensor:
@@ -28,10 +33,15 @@ class GlobalBatchNorm1d(nn.BatchNorm1d):
         dist.all_reduce(count)
         mean = all_reduce(wide.sum(0)) / count[0]  # [C]
         variance = all_reduce((wide - mean).square().sum(0)) / count[0]  # [C]
-        with torch.no_grad():
-            self.num_batches_tracked += 1
-            unbiased = variance * count[0] / (count[0] - 1).clamp_min(1)
-            self.running_mean.lerp_(mean.to(self.running_mean.dtype), self.momentum)
-            self.running_var.lerp_(unbiased.to(self.running_var.dtype), self.momentum)
+        if self.training and self.running_mean is not None:
+            self._track(mean.detach(), variance.detach(), count[0])
         normed = (wide - mean) * torch.rsqrt(variance + self.eps)
-        return (normed * self.weight + self.bias).to(x.dtype)
+        return (normed if self.weight is None else normed * self.weight + self.bias).to(x.dtype)
+
+    def _track(self, mean: torch.Tensor, variance: torch.Tensor, count: torch.Tensor) -> None:
+        """Moves the running statistics; a momentum of None stands for their plain average, as in torch."""
+        self.num_batches_tracked += 1
+        share = 1 / self.num_batches_tracked.to(mean.dtype) if self.momentum is None else self.momentum
+        unbiased = variance * count / (count - 1).clamp_min(1)
+        self.running_mean += share * (mean - self.running_mean)
+        self.running_var += share * (unbiased - self.running_var)

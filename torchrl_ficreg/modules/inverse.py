@@ -1,9 +1,9 @@
 """Inverse dynamics models: which action led from one latent to the next, and how sure can one be?
 
-One interface. All read ``latent`` and ``("next", "latent")`` [..., T, D] and write ``recovered_action`` [..., T, F * A],
-z-scored. Some say how sure they are, per dimension: a Gaussian head writes ``recovered_action_log_var``, an ensemble
-writes ``recovered_action_spread``, the variance among its members. None holds a BatchNorm: the same network judges
-imagined transitions, and running statistics would be moved by them.
+One interface. All read ``latent`` and ``("next", "latent")`` [..., T, D] and write ``recovered_action``
+[..., T, F * A], z-scored. Some say how sure they are, per dimension: a Gaussian head writes
+``recovered_action_log_var``, an ensemble writes ``recovered_action_spread``, the variance among its members. None
+holds a BatchNorm: the same network judges imagined transitions, and running statistics would be moved by them.
 """
 
 from __future__ import annotations
@@ -80,6 +80,7 @@ class InverseEnsemble(nn.Module):
     def forward(self, latent: torch.Tensor, next_latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """[..., D] and [..., D] -> mean and variance over members, each [..., F * A]."""
         recovered = torch.stack([member(latent, next_latent) for member in self.members])  # [K, ..., F * A]
+        recovered = recovered if recovered.dtype == torch.float64 else recovered.float()  # variances cancel in bfloat16
         return recovered.mean(0), recovered.var(0, unbiased=False)
 
 

@@ -34,6 +34,10 @@ class Clip(NamedTuple):
 def read_clip(tensordict: TensorDictBase, pixels: NestedKey, action: NestedKey, mask: NestedKey) -> Clip:
     """Reads and checks a clip.
 
+    Values are looked at on the CPU and in eager mode only, where it costs next to nothing. On an accelerator it would
+    hold up the queue, and in a compiled graph break it: there a wholly masked batch gives terms of zero, and actions
+    that are not finite give terms that are not.
+
     Args:
         tensordict: left as it is.
         pixels: key of [..., T, 3, H, W], T >= 2.
@@ -42,9 +46,11 @@ def read_clip(tensordict: TensorDictBase, pixels: NestedKey, action: NestedKey, 
 
     Raises:
         KeyError: a key is missing.
-        ValueError: shapes that do not fit.
+        ValueError: shapes that do not fit, no transition left by the mask, or actions that are not finite.
     """
     frames, blocks = require(tensordict, pixels), require(tensordict, action)
+    if 0 in frames.shape:
+        raise ValueError(f"the batch of clips is empty, pixels are {list(frames.shape)}: sample at least one clip.")
     if frames.ndim < 5 or frames.shape[-4] < 2:
         raise ValueError(
             f"a loss needs clips of at least 2 frames, pixels [B, T, 3, H, W] with T >= 2, "
@@ -65,7 +71,20 @@ def read_clip(tensordict: TensorDictBase, pixels: NestedKey, action: NestedKey, 
             )
         trusted = trusted[..., :-1]
         blocks = torch.where(trusted.unsqueeze(-1), blocks, 0.0)
+    if blocks.device.type == "cpu" and not torch.compiler.is_compiling():
+        _check_values(blocks, trusted)
     return Clip(frames, blocks, trusted)
+
+
+def _check_values(blocks: torch.Tensor, mask: torch.Tensor | None) -> None:
+    if mask is not None and not mask.any():
+        raise ValueError("the mask leaves no transition of the batch to learn from: sample other clips.")
+    if not blocks.isfinite().all():
+        bad = (~blocks.isfinite().all(-1)).sum().item()
+        raise ValueError(
+            f"{bad} of {blocks[..., 0].numel()} action blocks hold a NaN or an infinity: set their mask to false, or "
+            "drop them from the dataset."
+        )
 
 
 def require(tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
@@ -97,8 +116,8 @@ def check_module(name: str, module: TensorDictModule, num_inputs: int, out_key: 
         raise ValueError(f"the {name} must read {num_inputs} entries, it reads {module.in_keys}: wrap it accordingly.")
     if len(module.out_keys) > 1 and out_key not in module.out_keys:
         raise ValueError(
-            f"the {name} writes {module.out_keys} and none is {out_key!r}: name the right one with selected_out_keys "
-            "of its TensorDictSequential, or with the loss's set_keys(...)."
+            f"the {name} writes {module.out_keys} and none is {out_key!r}: rename the right one, or select it with "
+            "selected_out_keys of a TensorDictSequential."
         )
 
 
@@ -123,5 +142,13 @@ def call(module: TensorDictModule, params: TensorDictBase, *inputs: torch.Tensor
 
 
 def output(module: TensorDictModule, tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
-    """The entry ``key`` that a module wrote, or its only one, whatever that is called."""
-    return tensordict.get(key if len(module.out_keys) > 1 else module.out_keys[0])
+    """The entry ``key`` that a module wrote, or its only one, whatever that is called.
+
+    Raises:
+        KeyError: it wrote several, and none has that name.
+    """
+    key = key if len(module.out_keys) > 1 else module.out_keys[0]
+    value = tensordict.get(key, None)
+    if value is None:
+        raise KeyError(f"no {key!r} among {module.out_keys}, what the network writes: see loss.set_keys(...).")
+    return value

@@ -11,7 +11,7 @@ from tensordict.nn import dispatch, TensorDictModule
 from torchrl_ficreg.modules.inverse import LOG_VAR
 from torchrl_ficreg.objectives.base import Reduction, with_own_buffers
 from torchrl_ficreg.objectives.clip import Clip
-from torchrl_ficreg.objectives.judge import inverse_error, judge_report, Recovered, trust
+from torchrl_ficreg.objectives.judge import inverse_error, judge_report, mean_where, Recovered, trust
 from torchrl_ficreg.objectives.lewm import LeWMLoss
 from torchrl_ficreg.objectives.sigreg import SIGReg
 from torchrl_ficreg.objectives.terms import gaussian_nll, squared_error
@@ -114,10 +114,12 @@ class FICRegLoss(LeWMLoss):
         _check("context", context, ("detached", "live"))
         _check("consistency", consistency, ("mse", "nll", "trusted"))
         _check("consistency_target", consistency_target, ("action", "judge"))
-        if consistency_steps < 1:
-            raise ValueError(f"consistency_steps must be positive, got {consistency_steps}.")
+        if not (isinstance(consistency_steps, int) and consistency_steps >= 1):
+            raise ValueError(f"consistency_steps must be a positive whole number, got {consistency_steps}.")
         if consistency == "nll" and LOG_VAR not in inverse_model.out_keys:
-            raise ValueError(f"consistency='nll' needs a judge that writes {LOG_VAR!r}: InverseDynamicsModel(kind='gaussian').")
+            raise ValueError(
+                f"consistency='nll' needs a judge that writes {LOG_VAR!r}: InverseDynamicsModel(kind='gaussian')."
+            )
         self.context, self.consistency, self.consistency_target = context, consistency, consistency_target
         self.consistency_steps, self.diagnostics = consistency_steps, diagnostics
         if diagnostics:
@@ -172,7 +174,7 @@ class FICRegLoss(LeWMLoss):
         terms = {"loss_consistency": self.consistency_coeff * self._reduce(total / count.clamp_min(1), clip.mask)}
         if self.diagnostics:
             terms |= judge_report(recovered, verdict, clip.action, clip.mask)
-            terms["judge_trust"] = weight.detach().flatten(0, -2).mean(0)
+            terms["judge_trust"] = mean_where(weight.detach().float().flatten(0, -2), clip.mask)
         return terms
 
     def _steps(self, clip: Clip) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -31,13 +32,16 @@ class LatentHealth:
     @property
     def alarm(self) -> str | None:
         """One line that says what is wrong, or None."""
+        if not math.isfinite(self.floor_ratio):
+            return "the latents are not finite: lower the learning rate, and look for NaN in the clips."
         collapsed = self.samples * COLLAPSE / GAUSSIAN_FLOOR
-        if self.floor_ratio > 0.5 * collapsed:
+        # Among a handful of samples collapse cannot be told from chance.
+        if self.samples >= 8 and self.floor_ratio > max(2.0, 0.5 * collapsed):
             return (
                 f"the latents are close to collapse: SIGReg is {self.floor_ratio:.0f} times its floor, {collapsed:.0f} "
                 "is a single point. Raise sigreg_coeff or lower the learning rate."
             )
-        if self.effective_rank < max(1.5, 0.1 * self.dims):
+        if self.effective_rank < max(1.5, 0.1 * min(self.dims, self.samples)) and self.dims > 1:
             return (
                 f"the latents use {self.effective_rank:.1f} of {self.dims} dimensions: raise sigreg_coeff, or lower "
                 "latent_dim."
@@ -68,8 +72,10 @@ def latent_health(latent: torch.Tensor, sigreg: SIGReg | None = None) -> LatentH
     finally:
         sigreg.train(training)
     flat = latent.float().flatten(0, -2)  # [N, D]
+    samples = latent.shape[-2] if sigreg.unit == "time" else len(flat)
+    if not flat.isfinite().all():
+        return LatentHealth(math.nan, math.nan, flat.shape[1], samples)
     spectrum = torch.linalg.svdvals(flat - flat.mean(0)).square()
     share = spectrum / spectrum.sum().clamp_min(1e-12)
     entropy = -(share * share.clamp_min(1e-12).log()).sum()
-    samples = latent.shape[-2] if sigreg.unit == "time" else len(flat)
     return LatentHealth(value / GAUSSIAN_FLOOR, entropy.exp().item(), flat.shape[1], samples)

@@ -14,7 +14,8 @@ from torchrl_ficreg.objectives.sigreg import SIGReg
 class JointInverseLoss(LeWMLoss):
     r"""Latent prediction whose encoder is shaped by the inverse model, with or without SIGReg.
 
-    .. math:: \|g_\phi(z_{1:t}, a_t) - z_{t+1}\|^2 + \lambda \, \mathrm{SIGReg}(Z) + \mu \|h_\psi(z_t, z_{t+1}) - a_t\|^2
+    .. math:: \|g_\phi(z_{1:t}, a_t) - z_{t+1}\|^2 + \lambda \, \mathrm{SIGReg}(Z)
+              + \mu \|h_\psi(z_t, z_{t+1}) - a_t\|^2
 
     As in ICM (arXiv 1705.05363), PLDM (arXiv 2502.14819) and sensorimotor world models (SMWM, arXiv 2606.20104): what
     carries no trace of the action may be forgotten, so the inverse loss alone can keep the latents from collapsing
@@ -29,8 +30,8 @@ class JointInverseLoss(LeWMLoss):
     ``loss_idm``          **yes**  no         yes
     ====================  =======  =========  =============
 
-    The clip is that of :class:`~torchrl_ficreg.LeWMLoss`. With ``sigreg_coeff=0`` at construction the regulariser is not computed and
-    ``loss_sigreg`` not written.
+    The clip is that of :class:`~torchrl_ficreg.LeWMLoss`. With ``sigreg_coeff=0`` at construction the regulariser is
+    not computed and ``loss_sigreg`` not written.
 
     Args:
         encoder, predictor, sigreg, sigreg_coeff, reduction: see :class:`~torchrl_ficreg.LeWMLoss`.

@@ -49,8 +49,9 @@ def judge_report(
 ) -> dict[str, torch.Tensor]:
     """How good the judge is, per action dimension, all detached.
 
-    The shuffled control compares its verdicts on imagined transitions with the actions of *other* samples: a judge
-    that likes wrong actions as well is worthless, and its number there is not clearly below the true one.
+    The shuffled control compares its verdicts on imagined transitions with the actions of *other* clips (the
+    previous one of the batch): a judge that likes wrong actions as well is worthless, and its number there is not
+    clearly below the true one.
 
     Args:
         real, imagined: actions recovered from real and imagined transitions, [..., T, F * A].
@@ -62,18 +63,25 @@ def judge_report(
         a judge that knows nothing.
     """
     with torch.no_grad():
-        shuffled = action.roll(1, 0)
-        rows = {"real": (real, action), "imagined": (imagined, action), "shuffled": (imagined, shuffled)}
-        return {f"judge_r2_{name}": _explained(guess, truth, mask) for name, (guess, truth) in rows.items()}
+        real, imagined, action = (value.float().flatten(0, -3) for value in (real, imagined, action))  # [B, T, F * A]
+        mask = None if mask is None else mask.flatten(0, -2)  # [B, T]
+        both = None if mask is None else mask & mask.roll(1, 0)  # a masked action is no wrong action, but none
+        return {
+            "judge_r2_real": _explained(real, action, mask),
+            "judge_r2_imagined": _explained(imagined, action, mask),
+            "judge_r2_shuffled": _explained(imagined, action.roll(1, 0), both),
+        }
 
 
 def _explained(guess: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    guess, truth = guess.float().flatten(0, -2), truth.float().flatten(0, -2)  # [N, F * A]
-    keep = torch.ones_like(guess[:, 0], dtype=torch.bool) if mask is None else mask.flatten()  # [N]
-    count = keep.sum().clamp_min(1)
+    guess, truth = guess.flatten(0, -2), truth.flatten(0, -2)  # [N, F * A]
+    variance = mean_where((truth - mean_where(truth, mask)).square(), mask)
+    return 1 - mean_where((guess - truth).square(), mask) / variance.clamp_min(1e-8)
 
-    def mean(value: torch.Tensor) -> torch.Tensor:
-        return torch.where(keep.unsqueeze(-1), value, 0.0).sum(0) / count  # [F * A]
 
-    variance = mean((truth - mean(truth)).square())
-    return 1 - mean((guess - truth).square()) / variance.clamp_min(1e-8)
+def mean_where(value: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """Mean over the rows that count, [N, C] and a mask of N entries -> [C]; 0 where there are none."""
+    if mask is None:
+        return value.mean(0)
+    keep = mask.reshape(-1, 1)  # [N, 1]
+    return torch.where(keep, value, 0.0).sum(0) / keep.sum().clamp_min(1)

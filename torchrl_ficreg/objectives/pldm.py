@@ -114,6 +114,8 @@ class PLDMLoss(LatentLoss):
         before, after = latent[..., :-1, :], latent[..., 1:, :]
         predicted = self._predict(before, clip.action, self.predictor_params)  # [B, T - 1, D]
         over_batch = latent.flatten(0, -3).transpose(0, 1)  # [T, B, D]
+        if over_batch.shape[1] < 2:
+            raise ValueError("variance and covariance over the batch need at least 2 clips, got 1: use a larger batch.")
         compute = {
             "loss_std": lambda: hinge_std(over_batch, -2, self.std_margin).mean(),
             "loss_cov": lambda: off_diagonal_covariance(over_batch).mean(),

@@ -57,7 +57,7 @@ class SIGReg(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if num_directions < 1 or num_knots < 2 or max_knot <= 0:
+        if num_directions < 1 or num_knots < 2 or not 0 < max_knot < math.inf:
             raise ValueError(
                 "SIGReg needs num_directions >= 1, num_knots >= 2 and max_knot > 0, "
                 f"got {num_directions}, {num_knots} and {max_knot}."
@@ -119,8 +119,8 @@ def standard_normal(state: torch.Tensor, count: int) -> torch.Tensor:
     position = torch.arange(2 * half, device=state.device)  # int64; products wrap around
     stream = _mix(_mix(state[:1] * _GOLDEN + 1) + state[1:])
     bits = _mix(stream + (position + 1) * _GOLDEN)
-    # The upper 24 bits fill a float32 mantissa; half a unit keeps the logarithm finite.
-    uniform = (((bits >> 40) & 0xFFFFFF).float() + 0.5) / 2**24
+    # 23 bits and a half fill a float32 mantissa: strictly between 0 and 1, so that no radius is 0 or infinite.
+    uniform = (((bits >> 41) & 0x7FFFFF).float() + 0.5) / 2**23
     radius = (-2 * uniform[:half].log()).sqrt()
     angle = 2 * math.pi * uniform[half:]
     return torch.cat([radius * angle.cos(), radius * angle.sin()])[:count]

@@ -12,7 +12,16 @@ def _widen(value: Tensor) -> Tensor:
 
 
 def squared_error(prediction: Tensor, target: Tensor) -> Tensor:
-    """Squared error by dimension, at least float32: [..., C] and [..., C] -> [..., C]."""
+    """Squared error by dimension, at least float32: [..., C] and [..., C] -> [..., C].
+
+    Raises:
+        ValueError: the shapes differ; nothing is broadcast.
+    """
+    if prediction.shape != target.shape:
+        raise ValueError(
+            f"a prediction must have the shape of its target, got {list(prediction.shape)} for {list(target.shape)}: "
+            "check the widths the networks were built for."
+        )
     return (_widen(prediction) - _widen(target)).square()
 
 

@@ -21,12 +21,13 @@ class VarianceHinge(nn.Module):
 
     def __init__(self, margin: float = 1.0) -> None:
         super().__init__()
-        if margin <= 0:
+        if not margin > 0:
             raise ValueError(f"margin must be positive, got {margin}.")
         self.margin = margin
 
     def forward(self, latent: torch.Tensor) -> torch.Tensor:
-        """Latents [..., B, D], B the samples -> mean hinge []."""
+        """Latents [..., B, D], B >= 2 the samples -> mean hinge []."""
+        _check_samples(latent)
         return hinge_std(latent, -2, self.margin).mean()
 
 
@@ -39,7 +40,8 @@ class CovariancePenalty(nn.Module):
     """
 
     def forward(self, latent: torch.Tensor) -> torch.Tensor:
-        """Latents [..., B, D], B the samples -> mean penalty []."""
+        """Latents [..., B, D], B >= 2 the samples -> mean penalty []."""
+        _check_samples(latent)
         return off_diagonal_covariance(latent).mean()
 
 
@@ -54,5 +56,11 @@ class TemporalStraightness(nn.Module):
     def forward(self, latent: torch.Tensor) -> torch.Tensor:
         """Latents [..., T, D] with T >= 3 -> []."""
         if latent.ndim < 2 or latent.shape[-2] < 3:
-            raise ValueError(f"straightness needs trajectories [..., T, D] of T >= 3 latents, got {list(latent.shape)}.")
+            shape = list(latent.shape)
+            raise ValueError(f"straightness needs trajectories [..., T, D] of T >= 3 latents, got {shape}.")
         return straightness(latent).mean()
+
+
+def _check_samples(latent: torch.Tensor) -> None:
+    if latent.ndim < 2 or latent.shape[-2] < 2:
+        raise ValueError(f"a statistic over samples needs latents [..., B, D] with B >= 2, got {list(latent.shape)}.")

@@ -1,0 +1,195 @@
+"""Claims about several processes: what is a statistic of the batch is one of the global batch.
+
+The convention is that of distributed data parallel training: gradients are averaged over ranks. So the average over
+ranks of parameter gradients, and each rank's gradient of its own latents divided by the number of ranks, must be those
+of one process on the concatenated batch.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as mp
+from loss_collection import make_clip, make_loss
+from torch import nn
+
+from torchrl_ficreg import SIGReg
+from torchrl_ficreg.modules.batch_norm import GlobalBatchNorm1d
+
+TIMES, DIM, DTYPE = 3, 5, torch.float64
+SIZES = {2: {"equal": [8, 8], "unequal": [3, 13]}, 4: {"equal": [4, 4, 4, 4], "unequal": [2, 5, 3, 6]}}
+STEPS = ("paper", "live", "trusted", "two_steps", "lewm", "joint")  # losses that take a training step
+NORMS = {
+    "default": {},
+    "average": {"momentum": None},
+    "plain": {"affine": False},
+    "stateless": {"track_running_stats": False},
+}
+
+
+def noise(*shape: int, seed: int = 0, dtype: torch.dtype = DTYPE) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def statistic(rows: slice, masked: bool, unit: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+    """SIGReg of latents that a linear map makes: value, gradients of map and latents, and the state it is left in."""
+    weight = torch.eye(DIM, dtype=dtype).add(0.1 * noise(DIM, DIM, seed=2, dtype=dtype)).requires_grad_()
+    latent = 1.5 * noise(TIMES, 16, DIM, dtype=dtype)[:, rows] @ weight  # [T, B of this rank, D]
+    latent.retain_grad()
+    mask = (noise(TIMES, 16, seed=3) > -0.5)[:, rows] if masked else None
+    sigreg = SIGReg(32, unit=unit)
+    sigreg(latent.detach(), mask)
+    value = sigreg(latent, mask)
+    (2 * value).backward()
+    return {"value": value.detach(), "weight": weight.grad, "latent": latent.grad, "state": sigreg.generator_state}
+
+
+def normed(rows: slice, kind: str, length: int | None) -> dict[str, torch.Tensor]:
+    """Two training calls of a BatchNorm layer, and one in eval mode: outputs, gradients, state."""
+    norm = GlobalBatchNorm1d(DIM, dtype=DTYPE, **NORMS[kind])
+    if norm.affine:
+        with torch.no_grad():
+            norm.weight.copy_(noise(DIM, seed=4))
+            norm.bias.copy_(noise(DIM, seed=5))
+    shape = (16, DIM) if length is None else (16, DIM, length)
+    result = {}
+    for call in range(2):
+        x = (3 + 2 * noise(*shape, seed=call))[rows].requires_grad_()
+        norm.zero_grad()
+        y = norm(x)
+        (y * noise(*shape, seed=7)[rows]).sum().backward()
+        result |= {f"output {call}": y.detach(), f"input {call}": x.grad}
+    result |= {name: param.grad for name, param in norm.named_parameters()} | dict(norm.named_buffers())
+    return result | {"eval": norm.eval()(noise(*shape, seed=8)).detach()}
+
+
+def trained(name: str, rows: slice, parallel: bool) -> dict[str, torch.Tensor]:
+    """State of a loss after two steps of SGD, in float64."""
+    loss = make_loss(name, dropout=0.0).to(DTYPE)
+    optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)
+    call = nn.parallel.DistributedDataParallel(loss) if parallel else loss
+    for seed in range(2):
+        clip = make_clip(16, seed=seed)[rows]
+        clip["pixels"], clip["action"] = clip["pixels"].to(DTYPE) / 255, clip["action"].to(DTYPE)
+        optimizer.zero_grad()
+        sum(call(clip).values()).backward()
+        optimizer.step()
+    return {key: value.clone() for key, value in loss.state_dict().items()}
+
+
+def scenarios(rows: dict[str, slice], world: int) -> dict[tuple, dict[str, torch.Tensor]]:
+    result = {}
+    for sizes, part in rows.items():
+        for masked in (False, True):
+            for unit in ("time", "batch_time"):
+                for dtype in (torch.float32, torch.float64):
+                    result["sigreg", sizes, masked, unit, dtype] = statistic(part, masked, unit, dtype)
+        for kind in NORMS:
+            for length in (None, 3):
+                result["norm", sizes, kind, length] = normed(part, kind, length)
+    for name in STEPS if world <= 2 else ("paper",):
+        result["step", name] = trained(name, rows["equal"], world > 1)
+    return result
+
+
+def work(rank: int, world: int, folder: str) -> None:
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(1)
+    dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=world)
+    try:
+        rows = {}
+        for name, sizes in SIZES[world].items():
+            start = sum(sizes[:rank])
+            rows[name] = slice(start, start + sizes[rank])
+        torch.save(scenarios(rows, world), f"{folder}/{rank}.pt")
+        dist.barrier()
+    finally:
+        dist.destroy_process_group()
+
+
+@pytest.fixture(scope="module")
+def single():
+    """What one process makes of the whole batch."""
+    return scenarios({"equal": slice(None), "unequal": slice(None)}, 1)
+
+
+@pytest.fixture(scope="module", params=[2, 4])
+def ranks(request, tmp_path_factory):
+    """What each of the processes makes of its part."""
+    folder = str(tmp_path_factory.mktemp("ranks"))
+    mp.spawn(work, args=(request.param, folder), nprocs=request.param)
+    return [torch.load(f"{folder}/{rank}.pt", weights_only=False) for rank in range(request.param)]
+
+
+def relative(ours: torch.Tensor, expected: torch.Tensor) -> float:
+    return ((ours - expected).norm() / expected.norm()).item()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("unit", ["time", "batch_time"])
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("sizes", ["equal", "unequal"])
+def test_sigreg_is_that_of_the_global_batch(ranks, single, sizes, masked, unit, dtype):
+    """Value and gradients within 1e-5 (float64: 1e-12), whatever the parts, and the same directions ever after."""
+    key = ("sigreg", sizes, masked, unit, dtype)
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-12
+    expected, parts = single[key], [rank[key] for rank in ranks]
+    for part in parts:
+        assert relative(part["value"], expected["value"]) < tolerance
+        assert part["state"].equal(expected["state"])
+    assert relative(sum(part["weight"] for part in parts) / len(parts), expected["weight"]) < tolerance
+    latent = torch.cat([part["latent"] for part in parts], 1) / len(parts)
+    assert relative(latent, expected["latent"]) < tolerance
+
+
+@pytest.mark.parametrize("length", [None, 3])
+@pytest.mark.parametrize("kind", NORMS)
+@pytest.mark.parametrize("sizes", ["equal", "unequal"])
+def test_batch_norm_is_that_of_the_global_batch(ranks, single, sizes, kind, length):
+    """Outputs, running statistics and gradients; the loss here is a sum over samples, so gradients add up."""
+    key = ("norm", sizes, kind, length)
+    expected, parts = single[key], [rank[key] for rank in ranks]
+    for name, value in expected.items():
+        if name.startswith(("output", "input")):
+            ours = torch.cat([part[name] for part in parts])
+        elif name in ("weight", "bias"):
+            ours = sum(part[name] for part in parts)
+        else:
+            if name == "eval" and kind == "stateless":
+                continue  # every rank normalises what all of them see, here the same batch as many times
+            assert all(part[name].equal(parts[0][name]) for part in parts), name
+            ours = parts[0][name]
+        torch.testing.assert_close(ours, value, rtol=1e-10, atol=1e-12, msg=lambda text, name=name: f"{name}: {text}")
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_training_steps_are_those_of_one_process_on_the_whole_batch(ranks, single, name):
+    """Parameters, BatchNorm statistics and generator state agree to 1e-9, on all ranks."""
+    if ("step", name) not in ranks[0]:
+        pytest.skip("on two processes only")
+    expected = single["step", name]
+    start = make_loss(name, dropout=0.0).to(DTYPE).state_dict()
+    moved = [key for key in expected if not start[key].equal(expected[key])]
+    assert any(key.startswith("predictor_params") for key in moved)
+    for rank in ranks:
+        for key, value in rank["step", name].items():
+            assert value.shape == expected[key].shape, key
+            assert value.allclose(expected[key], rtol=1e-9, atol=1e-9), key
+
+
+@pytest.mark.parametrize("kind", NORMS)
+@pytest.mark.parametrize("shape", [(16, DIM), (16, DIM, 3)])
+def test_in_one_process_it_is_batch_norm_to_the_last_bit(kind, shape):
+    ours, theirs = GlobalBatchNorm1d(DIM, **NORMS[kind]), nn.BatchNorm1d(DIM, **NORMS[kind])
+    assert list(ours.state_dict()) == list(theirs.state_dict())
+    for mode in (True, True, False):
+        results = []
+        for norm in (ours, theirs):
+            x = noise(*shape, dtype=torch.float32).requires_grad_()
+            y = norm.train(mode)(x)
+            y.square().sum().backward()
+            results.append([y, x.grad, *(p.grad for p in norm.parameters()), *norm.buffers()])
+        assert all(one.equal(other) for one, other in zip(*results, strict=True))

@@ -1,0 +1,65 @@
+"""Claims about the alarm: silent on a Gaussian of any shape, loud at collapse, at low rank and at NaN."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchrl_ficreg import SIGReg
+from torchrl_ficreg.objectives import latent_health
+
+
+def noise(*shape: int) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("shape", [(4, 512, 64), (128, 192), (32, 2), (256, 1), (8, 192), (4, 8)])
+def test_a_gaussian_is_at_the_floor_and_raises_no_alarm(shape):
+    health = latent_health(noise(*shape))
+    if math.prod(shape[:-1]) >= 128 and shape[-1] > 1:
+        assert health.floor_ratio == pytest.approx(1, abs=0.2)
+    assert health.alarm is None
+
+
+def test_effective_rank_counts_the_dimensions_that_are_used():
+    """Of a flat spectrum it is the number of its entries (Roy and Vetterli, 2007)."""
+    rows = torch.eye(16).repeat(8, 1)
+    for used in (2, 5, 16):
+        centred = rows[:, :used] - rows[:, :used].mean(0)
+        basis = torch.linalg.qr(centred)[0]
+        latent = torch.cat([basis, torch.zeros(128, 16 - used)], 1)
+        assert latent_health(latent).effective_rank == pytest.approx(used, rel=1e-3)
+
+
+@pytest.mark.parametrize("samples", [8, 128])
+@pytest.mark.parametrize("place", [0.0, 1.0])
+def test_collapse_to_a_point_raises_the_alarm(samples, place):
+    health = latent_health(torch.full((2, samples, 16), place) + 1e-3 * noise(2, samples, 16))
+    assert "close to collapse" in health.alarm
+    assert health.floor_ratio > 0.35 * samples
+
+
+def test_low_rank_raises_the_alarm():
+    """All dimensions are one and the same: some directions look healthy, the rank does not."""
+    latent = noise(256, 1).expand(256, 32) / 32**0.5
+    health = latent_health(latent)
+    assert health.effective_rank == pytest.approx(1, abs=0.01)
+    assert health.alarm is not None
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_latents_that_are_not_finite_raise_the_alarm(value):
+    latent = noise(32, 8)
+    latent[3, 3] = value
+    assert "not finite" in latent_health(latent).alarm
+
+
+def test_the_regulariser_is_left_as_it_was():
+    for training in (True, False):
+        sigreg = SIGReg(16, unit="batch_time").train(training)
+        health = latent_health(noise(4, 32, 8).requires_grad_(), sigreg)
+        assert health.samples == 128
+        assert sigreg.training == training
+        assert sigreg.generator_state.tolist() == [0, 0]

@@ -28,6 +28,7 @@ from torchrl_ficreg import (
     MPCPolicy,
     PlanConfig,
     PLDMLoss,
+    SIGReg,
 )
 from torchrl_ficreg.data import EpisodeWriter, OfflineTrajectories
 from torchrl_ficreg.envs import collect_episodes, make_env
@@ -120,13 +121,16 @@ def make_loss(cfg: DictConfig, model: LatentWorldModel, inverse_model: InverseDy
     """The loss of a configuration's ``method``."""
     networks, weights = (model.encoder, model.predictor, inverse_model), cfg.loss
     settings = {key: value for key, value in cfg.method.items() if key not in ("name", "consistency_warmup")}
+    sigreg = SIGReg(seed=cfg.seed).to(next(model.parameters()).device)
     if cfg.method.name == "lewm":
-        return LeWMLoss(*networks[:2], sigreg_coeff=weights.sigreg_coeff)
+        return LeWMLoss(*networks[:2], sigreg=sigreg, sigreg_coeff=weights.sigreg_coeff)
     if cfg.method.name == "joint_inverse":
-        return JointInverseLoss(*networks, sigreg_coeff=weights.sigreg_coeff, idm_coeff=weights.idm_coeff)
+        return JointInverseLoss(
+            *networks, sigreg=sigreg, sigreg_coeff=weights.sigreg_coeff, idm_coeff=weights.idm_coeff
+        )
     if cfg.method.name == "pldm":
         return PLDMLoss(*networks, **settings)
-    return FICRegLoss(*networks, **settings, **weights)
+    return FICRegLoss(*networks, sigreg=sigreg, **settings, **weights)
 
 
 def add_hooks(cfg: DictConfig, trainer: OfflineTrainer) -> None:

@@ -14,11 +14,10 @@ from pathlib import Path
 import torch
 from cli import entry_point
 from omegaconf import DictConfig
+from run_dir import check_run_dir, claim_run_dir
 from utils import (
     add_hooks,
-    check_run_dir,
     check_settings,
-    claim_run_dir,
     collect_dataset,
     get_device,
     make_card,

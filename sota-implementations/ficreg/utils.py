@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import platform
@@ -35,8 +34,6 @@ from torchrl_ficreg.envs import collect_episodes, make_env
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
 from torchrl_ficreg.modules.precision import uses_bf16
 from torchrl_ficreg.trainers import CoefficientSchedule, LatentAlarm, ModelCard, OfflineTrainer
-from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS
-from torchrl_ficreg.trainers.offline import METRICS
 
 
 def get_device(name: str) -> torch.device:
@@ -158,7 +155,7 @@ def make_logger(cfg: DictConfig, run_dir: Path) -> Logger | None:
     except ImportError as error:
         package = "'torchrl_ficreg[wandb]'" if backend == "wandb" else "tensorboard"
         raise ImportError(f"logger.backend={backend} needs a package: pip install {package}.") from error
-    settings = _flat(OmegaConf.to_container(cfg, resolve=True))
+    settings = flatten(OmegaConf.to_container(cfg, resolve=True))
     plain = (int, float, str, bool)  # all that tensorboard takes
     logger.log_hparams({key: value if isinstance(value, plain) else str(value) for key, value in settings.items()})
     return logger
@@ -236,53 +233,11 @@ def check_settings(cfg: DictConfig) -> None:
     make_env(cfg.env.name, **OmegaConf.to_container(cfg.env.kwargs)).close()
 
 
-# Settings that change neither the weights nor how they are reached; a finished run may be given others.
-_FREE = ("collect.", "device", "evaluation.", "plan.", "logger.", "env.budget", "env.goal_offset", "env.state_unit")
-
-
-def check_run_dir(cfg: DictConfig) -> Path:
-    """The run's folder, which belongs to one configuration as soon as that one has trained. Writes nothing.
-
-    Raises:
-        ValueError: it holds a run of another configuration.
-    """
-    run_dir, ours = Path(cfg.runs_dir) / cfg.name, OmegaConf.to_container(cfg, resolve=True)
-    path = run_dir / "config.yaml"
-    if path.exists() and ((run_dir / METRICS).exists() or (run_dir / CHECKPOINTS).exists()):
-        theirs = OmegaConf.to_container(OmegaConf.load(path))
-        if not isinstance(theirs, dict) or "model" not in theirs:
-            raise ValueError(f"{path} is damaged: restore it, or give another name=...")
-        for config in (ours, theirs):  # a project may be moved, or started from another folder
-            config["data_dir"], config["runs_dir"] = (str(Path(config[key]).resolve()) for key in ("data_dir", "runs_dir"))
-        differ = sorted(key for key in _flat(ours) | _flat(theirs) if _flat(ours).get(key) != _flat(theirs).get(key))
-        differ = [key for key in differ if not key.startswith(_FREE)]
-        if differ:
-            what = ", ".join(f"{key}: {_flat(theirs).get(key)} -> {_flat(ours).get(key)}" for key in differ[:3])
-            raise ValueError(f"{run_dir} holds a run of another configuration ({what}): give another name=...")
-    return run_dir
-
-
-def claim_run_dir(cfg: DictConfig) -> Path:
-    """Makes the run's folder, takes it for this process and notes the configuration in it.
-
-    Raises:
-        ValueError: it holds a run of another configuration.
-        RuntimeError: another process is at work in it.
-    """
-    run_dir = check_run_dir(cfg)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    try:  # held, on the folder itself, until this process ends
-        fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise RuntimeError(f"another process is at work in {run_dir}: wait for it, or give another name=...") from error
-    write_text(run_dir / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
-    return run_dir
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as one level of dotted names."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat
 
 

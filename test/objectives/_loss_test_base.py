@@ -18,7 +18,7 @@ from torchrl.objectives.common import LossModule
 DEFAULT_KEYS = {
     name: name for name in ("pixels", "action", "mask", "latent", "predicted_latent", "recovered_action")
 }
-PER_TRANSITION = {"loss_pred", "loss_idm", "loss_consistency", "loss_sim_t"}  # the other terms are one number
+PER_TRANSITION = {"loss_pred", "loss_idm", "loss_consistency", "loss_time_sim"}  # the other terms are one number
 
 
 def call(loss: LossModule, *args, **kwargs):

@@ -42,7 +42,7 @@ LIVE = {**DETACHED, "loss_consistency": {"encoder": True, "predictor": True, "in
 JOINT = {**BASELINE, "loss_idm": {"encoder": True, "predictor": False, "inverse_model": True}}
 PLDM = {
     "loss_pred": BASELINE["loss_pred"],
-    **{f"loss_{name}": BASELINE["loss_sigreg"] for name in ("std", "cov", "sim_t", "std_t", "cov_t")},
+    **{f"loss_{name}": BASELINE["loss_sigreg"] for name in ("var", "cov", "time_sim", "time_var", "time_cov")},
     "loss_idm": JOINT["loss_idm"],
 }
 
@@ -61,7 +61,7 @@ COLLECTION = {
     "diagnostics": (FICRegLoss, {"diagnostics": True}, "mlp", DETACHED),
     "joint": (JointInverseLoss, {}, "mlp", JOINT),
     "joint_bare": (JointInverseLoss, {"sigreg_coeff": 0.0}, "mlp", {k: JOINT[k] for k in ("loss_pred", "loss_idm")}),
-    "pldm": (PLDMLoss, {"cov_t_coeff": 0.5}, "mlp", PLDM),
+    "pldm": (PLDMLoss, {"time_cov_coeff": 0.5}, "mlp", PLDM),
 }
 FICREG = [name for name, entry in COLLECTION.items() if entry[0] is FICRegLoss]
 

@@ -61,7 +61,7 @@ def test_gradcheck_of_every_live_term_by_latents(make, masked):
         TensorDictModule(_Step(3 + 2, 3), ["latent", "action"], ["predicted_latent"]),
         InverseDynamicsModel(3, 2, 4),
     ]
-    arguments = {"cov_t_coeff": 1.0} if make is PLDMLoss else {"sigreg": SIGReg(4)}
+    arguments = {"time_cov_coeff": 1.0} if make is PLDMLoss else {"sigreg": SIGReg(4)}
     loss = make(*networks[: 2 if make is LeWMLoss else 3], **arguments).double().eval()
     latent = 0.5 * torch.randn(4, 3, 3, 1, 1, dtype=torch.float64)
     clip = TensorDict({"action": torch.randn(4, 3, 2, dtype=torch.float64)})

@@ -21,7 +21,7 @@ def scripts(monkeypatch):
     """Imports a module of the scripts into this process: a new one for every misspelling would be slow."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     yield importlib.import_module
-    for name in ("cli", "utils"):
+    for name in ("cli", "utils", "run_dir"):
         sys.modules.pop(name, None)
 
 

@@ -30,10 +30,10 @@ def check_run_dir(cfg: DictConfig) -> Path:
             raise ValueError(f"{path} is damaged: restore it, or give another name=...")
         for config in (ours, theirs):  # a project may be moved, or started from another folder
             config["data_dir"], config["runs_dir"] = (str(Path(config[key]).resolve()) for key in ("data_dir", "runs_dir"))
-        differ = sorted(key for key in flatten(ours) | flatten(theirs) if flatten(ours).get(key) != flatten(theirs).get(key))
-        differ = [key for key in differ if not key.startswith(_FREE)]
+        ours, theirs = flatten(ours), flatten(theirs)
+        differ = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key) and not key.startswith(_FREE)]
         if differ:
-            what = ", ".join(f"{key}: {flatten(theirs).get(key)} -> {flatten(ours).get(key)}" for key in differ[:3])
+            what = ", ".join(f"{key}: {theirs.get(key)} -> {ours.get(key)}" for key in differ[:3])
             raise ValueError(f"{run_dir} holds a run of another configuration ({what}): give another name=...")
     return run_dir
 

@@ -175,8 +175,13 @@ def _run_group(
     lead = td.batch_size
     td[PLAN_SEED] = torch.from_numpy(group).reshape(lead)
     kept = range(max(0, min(record - int(group[0]), len(group))))
-    frames = [td[PIXELS].reshape(len(group), *td[PIXELS].shape[-3:])[: len(kept)].numpy().copy()]
-    outcome.goals += list(td[GOAL_PIXELS].reshape(len(group), *td[PIXELS].shape[-3:])[: len(kept)].numpy().copy())
+
+    def pictures(key: str) -> np.ndarray:
+        """Copies of the recorded environments' pictures, [kept, 3, H, W]."""
+        return td[key].reshape(len(group), *td[key].shape[-3:])[: len(kept)].numpy().copy()
+
+    frames = [pictures(PIXELS)]
+    outcome.goals += list(pictures(GOAL_PIXELS))
     outcome.success[group, 0] = td[SUCCESS].reshape(-1).numpy()
     seconds = 0.0
     for step in range(1, outcome.success.shape[1]):
@@ -186,7 +191,7 @@ def _run_group(
         td = step_mdp(env.step(td), keep_other=True)
         outcome.success[group, step] = td[SUCCESS].reshape(-1).numpy()
         if kept:
-            frames.append(td[PIXELS].reshape(len(group), *td[PIXELS].shape[-3:])[: len(kept)].numpy().copy())
+            frames.append(pictures(PIXELS))
         bar.update(len(group))
     outcome.frames += [np.stack([frame[i] for frame in frames]) for i in kept]
     plans = td.get(("mpc", "count"), None)

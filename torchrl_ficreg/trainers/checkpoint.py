@@ -11,6 +11,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
 from torchrl_ficreg.modules.presets import make_world_model, ModelConfig
+from torchrl_ficreg.modules.pretrained.folder import load_pretrained, WEIGHTS_FILE
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 CHECKPOINTS = "checkpoints"
@@ -66,19 +67,26 @@ def find_checkpoint(path: Path | str) -> Path:
     raise FileNotFoundError(f"no checkpoint at {path}: give a run directory that train.py made, or a checkpoint in it.")
 
 
-def load_world_model(path: Path | str) -> tuple[LatentWorldModel, InverseDynamicsModel, ModelCard]:
+def load_world_model(path: Path | str) -> tuple[LatentWorldModel, InverseDynamicsModel | None, ModelCard]:
     """Builds the networks a checkpoint describes and loads their weights and action statistics.
 
     Args:
-        path: a run directory, or one checkpoint.
+        path: a run directory, one checkpoint, or a folder written by
+            :func:`~torchrl_ficreg.modules.pretrained.save_pretrained` with a card.
 
     Returns:
-        the world model and its inverse dynamics model, in eval mode on the CPU, and the card.
+        the world model and its inverse dynamics model, in eval mode on the CPU, and the card. The inverse model is None
+        where a pretrained folder has none.
 
     Raises:
         FileNotFoundError: no checkpoint there.
         ValueError: a checkpoint of another kind, or one whose parts do not fit together.
     """
+    if (Path(path).expanduser() / WEIGHTS_FILE).is_file():
+        model, inverse_model, card = load_pretrained(Path(path).expanduser())
+        if card is None:
+            raise ValueError(f"{path} has no card, so its environment is unknown: save it with save_pretrained(card=).")
+        return model, inverse_model, ModelCard(**card)
     path = find_checkpoint(path)
     try:
         values = Checkpoint(card={}).load(path, components=[_CARD]).values

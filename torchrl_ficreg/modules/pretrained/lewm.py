@@ -1,0 +1,193 @@
+"""Official LeWM checkpoints, ``config.json`` beside ``weights.pt``, to our world model and back."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchrl_ficreg.data.statistics import ActionStatistics
+from torchrl_ficreg.modules.pretrained.lewm_config import config_from_sizes, sizes_from_config
+from torchrl_ficreg.modules.pretrained.lewm_names import matches, Naming, naming_of
+from torchrl_ficreg.modules.pretrained.sizes import build_world_model, world_model_sizes
+from torchrl_ficreg.modules.world_model import LatentWorldModel
+
+_CONFIG, _WEIGHTS = "config.json", "weights.pt"
+_WRAPPERS = ("state_dict", "model")
+_PREFIXES = ("model.", "module.")
+_UNUSED = ("sigreg.", "encoder.embeddings.mask_token")  # of the training loss; of masked pretraining
+_STATISTICS = ("action_mean", "action_std")
+
+
+def load_lewm(
+    path: Path | str,
+    *,
+    device: torch.device | str = "cpu",
+    frame_skip: int = 5,
+    statistics: ActionStatistics | None = None,
+) -> LatentWorldModel:
+    """Reads an official LeWM checkpoint (arXiv 2603.19312), in eval mode and float32.
+
+    Its encoder and predictor give the numbers of the published code. Two things are not in the files: the frame skip,
+    5 in all published models, and the mean and std of raw actions. Without ``statistics`` the model keeps means of 0
+    and stds of 1 and its planners would act in z-scores, so give those of the dataset it was trained on, or set
+    ``model.statistics`` later.
+
+    Tensors may bear the names of transformers 4 or 5, a prefix ``model.`` and a wrapper ``state_dict``, as a Lightning
+    checkpoint does; buffers of the loss and a mask token are left out. Nothing in the file is executed.
+
+    Args:
+        path: a folder with ``config.json`` and one ``.pt`` file, or a file with ``config.json`` beside it.
+        device: where the model goes.
+        frame_skip: F, raw actions in one block.
+        statistics: mean and std [A] of raw actions, environment units.
+
+    Raises:
+        FileNotFoundError: no such checkpoint, or no config.
+        ValueError: several weight files; an object checkpoint; networks that ours cannot stand for; tensors that are
+            missing, unexpected or of another shape.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_ficreg import make_world_model, ModelConfig
+        >>> sizes = {"image_size": 28, "predictor_depth": 1, "predictor_heads": 2}
+        >>> model, _ = make_world_model(ModelConfig.preset("paper", **sizes), action_dim=2)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = save_lewm(model, folder)
+        ...     same = load_lewm(folder)
+        >>> all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), same.state_dict().values()))
+        True
+    """
+    file, config = _find(Path(path).expanduser())
+    tensors = _read_tensors(file)
+    try:
+        model = build_world_model(sizes_from_config(config, tensors, frame_skip))
+        model.load_state_dict(_adopt(model, tensors))
+    except ValueError as error:
+        raise ValueError(f"{file} cannot be read as a LeWM checkpoint: {error}") from error
+    if statistics is not None:
+        model.statistics = statistics
+    return model.to(device).eval()
+
+
+def save_lewm(model: LatentWorldModel, folder: Path | str, *, naming: Naming = "transformers4") -> Path:
+    """Writes a world model as an official LeWM checkpoint, for the published loader or :func:`load_lewm`.
+
+    Weights are written in float32, whatever precision the model is in. Action statistics and frame skip have no place
+    in that format: keep them elsewhere.
+
+    Args:
+        model: with a vision transformer, and a predictor as wide as the latent.
+        folder: made if missing; must hold no other ``.pt`` file, for the published loader refuses several.
+        naming: ``"transformers4"``, as in the released weights, or ``"transformers5"``: the installed release of
+            ``transformers`` decides which one the published loader wants.
+
+    Returns:
+        the folder.
+
+    Raises:
+        TypeError: networks other than the package's own.
+        ValueError: an unknown naming, networks that LeWM cannot stand for, or other weights in the folder.
+    """
+    if naming not in ("transformers4", "transformers5"):
+        raise ValueError(f"naming must be 'transformers4' or 'transformers5', got {naming!r}.")
+    folder = Path(folder).expanduser()
+    others = sorted(file.name for file in folder.glob("*.pt") if file.name != _WEIGHTS)
+    if others:
+        raise ValueError(f"{folder} holds other weights ({', '.join(others)}): choose a folder of its own.")
+    sizes = world_model_sizes(model)
+    config = config_from_sizes(sizes)
+    published: dict[str, torch.Tensor] = {}
+    state = model.state_dict()
+    for match in matches(sizes, naming):
+        ours = state[match.ours].detach().cpu()
+        published |= match.publish(ours.float() if ours.is_floating_point() else ours)
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.save(published, folder / _WEIGHTS)
+    (folder / _CONFIG).write_text(json.dumps(config, indent=2) + "\n")
+    return folder
+
+
+def _find(path: Path) -> tuple[Path, dict[str, Any]]:
+    """The weight file that a path means, and the configuration beside it."""
+    if path.is_dir():
+        files = sorted(path.glob("*.pt"))
+        if len(files) > 1:
+            names = ", ".join(file.name for file in files)
+            raise ValueError(f"{path} holds {len(files)} weight files ({names}): give the path of one of them.")
+        if not files:
+            raise FileNotFoundError(f"no .pt file in {path}: a LeWM checkpoint is {_CONFIG} and {_WEIGHTS}.")
+        path = files[0]
+    if not path.is_file():
+        raise FileNotFoundError(f"no LeWM checkpoint at {path}: give a folder with {_CONFIG} and {_WEIGHTS}.")
+    config = path.with_name(_CONFIG)
+    if not config.is_file():
+        raise FileNotFoundError(f"no {_CONFIG} beside {path}: it names the sizes of the networks.")
+    try:
+        content = json.loads(config.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{config} is not JSON ({error}).") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{config} must hold a JSON object, got {type(content).__name__}.")
+    return path, content
+
+
+def _read_tensors(file: Path) -> dict[str, torch.Tensor]:
+    """Tensors of a checkpoint under their bare published names; nothing in the file is executed."""
+    try:
+        content = torch.load(file, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"{file} is no plain state dict. Whole pickled modules (*_object.ckpt) and checkpoints with objects in "
+            "them are refused, since reading them runs their code: save the state_dict() of the model, alone, where "
+            f"you trust it ({str(error).splitlines()[0] if str(error) else type(error).__name__})."
+        ) from error
+    for key in _WRAPPERS:
+        if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
+            content = content[key]
+    if not isinstance(content, Mapping) or not content:
+        raise ValueError(f"{file} must hold named tensors, got {type(content).__name__}.")
+    tensors: dict[str, torch.Tensor] = {}
+    for name, value in content.items():
+        name = _bare(str(name))
+        if name.startswith(_UNUSED):
+            continue
+        if not isinstance(value, torch.Tensor) or name in tensors:
+            what = "comes twice" if name in tensors else f"is a {type(value).__name__}, no tensor"
+            raise ValueError(f"{file}: {name!r} {what}: save the state_dict() of the model alone.")
+        tensors[name] = value
+    return tensors
+
+
+def _bare(name: str) -> str:
+    name = name.replace("_orig_mod.", "")  # torch.compile's
+    while name.startswith(_PREFIXES):
+        name = name.partition(".")[2]
+    return name
+
+
+def _adopt(model: LatentWorldModel, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Our state from published tensors, every one of which must have its place."""
+    state = model.state_dict()
+    table = matches(world_model_sizes(model), naming_of(list(tensors)))
+    shapes = {name: match.published_shape(state[match.ours]) for match in table for name in match.theirs}
+    missing, unexpected = sorted(shapes.keys() - tensors.keys()), sorted(tensors.keys() - shapes.keys())
+    mis_shaped = [
+        f"{name} {tuple(tensors[name].shape)} instead of {shape}"
+        for name, shape in sorted(shapes.items())
+        if name in tensors and tensors[name].shape != shape
+    ]
+    found = {"missing": missing, "unexpected": unexpected, "of another shape": mis_shaped}
+    wrong = [f"{len(names)} {what} ({_listed(names)})" for what, names in found.items() if names]
+    if wrong:
+        raise ValueError(f"of {len(shapes)} tensors that config.json asks for: {'; '.join(wrong)}.")
+    adopted = {match.ours: match.adopt(tensors, like=state[match.ours]) for match in table}
+    return adopted | {name: state[name] for name in _STATISTICS}
+
+
+def _listed(names: list[str], most: int = 12) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

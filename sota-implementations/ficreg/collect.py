@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from cli import entry_point
+from episodes import collect_dataset
 from omegaconf import DictConfig
-from utils import check_settings, collect_dataset
+from utils import check_settings
 
 from torchrl_ficreg.data import OfflineTrajectories
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from cli import entry_point
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from utils import get_device, make_policy, report, versions, write_json
+from utils import evaluate_beside_random, get_device, make_policy, report, versions, write_json
 
-from torchrl_ficreg.evaluation import evaluate_mpc, save_episodes_gif, StartGoalPairs, UniformPolicy
+from torchrl_ficreg.evaluation import save_episodes_gif, StartGoalPairs
 from torchrl_ficreg.trainers import find_checkpoint, load_world_model, ModelCard
 
 
@@ -34,15 +34,16 @@ def main(cfg: DictConfig) -> None:
         raise ValueError(f"the model was trained on {card.env}, the pairs belong to {pairs.env}: give others, pairs=...")
     plan = plan_of_run(cfg, card)
     policy = make_policy(plan, model.to(get_device(cfg.device)), card.action_low, card.action_high)
-    shared = {
-        "budget": cfg.budget or card.config["env"]["budget"],
-        "image_size": card.model["image_size"],
-        "num_envs": cfg.num_envs,
-        "env_kwargs": card.env_kwargs,
-    }
     method = card.config["method"]["name"]
-    outcome = evaluate_mpc(policy, pairs, record=cfg.record, description="plan", **shared)
-    floor = evaluate_mpc(UniformPolicy(card.action_low, card.action_high), pairs, description="random", **shared)
+    outcome, floor = evaluate_beside_random(
+        policy,
+        pairs,
+        card,
+        budget=cfg.budget or card.config["env"]["budget"],
+        num_envs=cfg.num_envs,
+        num_workers=cfg.num_workers,
+        record=cfg.record,
+    )
     results = {method: outcome.summary(), "random": floor.summary(), "plan": OmegaConf.to_container(plan)}
     output = Path(cfg.output or run_dir / "evaluation")
     output.mkdir(parents=True, exist_ok=True)

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import torch
 from cli import entry_point
+from episodes import find_dataset, make_dataset
 from omegaconf import DictConfig
 from run_dir import check_run_dir, claim_run_dir
 from utils import (
     add_hooks,
     check_settings,
-    collect_dataset,
+    evaluate_beside_random,
     get_device,
     make_card,
-    make_dataset,
     make_logger,
     make_loss,
     make_policy,
@@ -33,13 +33,11 @@ from utils import (
 
 from torchrl_ficreg import LatentWorldModel, make_world_model
 from torchrl_ficreg.evaluation import (
-    evaluate_mpc,
     latent_distance,
     plot_latent_distance,
     plot_learning_curve,
     save_episodes_gif,
     StartGoalPairs,
-    UniformPolicy,
 )
 from torchrl_ficreg.trainers import checkpoint_components, ModelCard, OfflineTrainer
 from torchrl_ficreg.trainers.offline import METRICS
@@ -50,7 +48,7 @@ def main(cfg: DictConfig) -> None:
     """Data, training, evaluation, report."""
     check_settings(cfg)
     check_run_dir(cfg)
-    data = collect_dataset(cfg)
+    data = find_dataset(cfg)
     pairs = draw_pairs(cfg, data)  # before training: too few episodes shall not come to light after it
     run_dir = claim_run_dir(cfg)
     model, card, training = train(cfg, data, run_dir)
@@ -110,15 +108,16 @@ def evaluate(
     held_out = make_dataset(cfg, data, "evaluation", drop_last=False)
     settings = cfg.evaluation
     pairs.save(run_dir / "pairs.json")
-    shared = {
-        "budget": cfg.env.budget,
-        "image_size": cfg.model.image_size,
-        "num_envs": settings.num_envs,
-        "env_kwargs": card.env_kwargs,
-    }
     policy = make_policy(cfg.plan, model, card.action_low, card.action_high)
-    outcome = evaluate_mpc(policy, pairs, record=settings.record, description="plan", **shared)
-    floor = evaluate_mpc(UniformPolicy(card.action_low, card.action_high), pairs, description="random", **shared)
+    outcome, floor = evaluate_beside_random(
+        policy,
+        pairs,
+        card,
+        budget=cfg.env.budget,
+        num_envs=settings.num_envs,
+        num_workers=settings.num_workers,
+        record=settings.record,
+    )
     profile = latent_distance(model, held_out)
     if (run_dir / METRICS).exists():
         plot_learning_curve(run_dir / METRICS, run_dir / "learning_curve.png")

@@ -12,9 +12,9 @@ from typing import Any
 import tensordict
 import torch
 import torchrl
+from episodes import describe_env
 from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import get_logger, Logger
-from tqdm import tqdm
 
 from torchrl_ficreg import (
     FICRegLoss,
@@ -29,8 +29,8 @@ from torchrl_ficreg import (
     PLDMLoss,
     SIGReg,
 )
-from torchrl_ficreg.data import EpisodeWriter, OfflineTrajectories
-from torchrl_ficreg.envs import collect_episodes, make_env
+from torchrl_ficreg.data import OfflineTrajectories
+from torchrl_ficreg.evaluation import Evaluation, evaluate_mpc, StartGoalPairs, UniformPolicy
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
 from torchrl_ficreg.modules.precision import uses_bf16
 from torchrl_ficreg.trainers import CoefficientSchedule, LatentAlarm, ModelCard, OfflineTrainer
@@ -48,63 +48,6 @@ def get_device(name: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device={name} cannot be used here ({error}): choose device=auto or device=cpu.") from error
     return device
-
-
-def dataset_path(cfg: DictConfig) -> Path:
-    """Where the dataset of a configuration lives."""
-    data = cfg.env.data
-    return Path(cfg.data_dir) / f"{cfg.env.name}_{cfg.model.image_size}px_{data.episodes}episodes_seed{data.seed}"
-
-
-def collect_dataset(cfg: DictConfig) -> Path:
-    """Records what the dataset still lacks, which may be nothing, and returns its folder."""
-    path, data = dataset_path(cfg), cfg.env.data
-    low, high = action_bounds(cfg.env.name)
-    meta = {
-        "env": cfg.env.name,
-        "env_kwargs": OmegaConf.to_container(cfg.env.kwargs),
-        "expert": OmegaConf.to_container(data.expert),
-        "image_size": cfg.model.image_size,
-        "max_steps": data.max_steps,
-        "seed": data.seed,
-        "action_low": low,
-        "action_high": high,
-    }
-    # Several runs may be started at once: one of them records, the others wait for it.
-    with EpisodeWriter(path, target_episodes=data.episodes, meta=meta, wait=True) as writer:
-        if writer.complete:
-            return path
-        episodes = collect_episodes(
-            cfg.env.name,
-            data.episodes,
-            seed=data.seed,
-            start=writer.num_episodes,
-            num_workers=cfg.collect.num_workers,
-            image_size=cfg.model.image_size,
-            max_steps=data.max_steps,
-            expert_kwargs=OmegaConf.to_container(data.expert),
-            env_kwargs=OmegaConf.to_container(cfg.env.kwargs),
-        )
-        first_step, done = writer.num_steps, writer.num_episodes
-        with tqdm(total=data.episodes, initial=done, desc="collect", unit="episode", dynamic_ncols=True) as bar:
-            for episode in episodes:
-                writer.append(episode)
-                bar.update()
-                rate = (writer.num_steps - first_step) / max(bar.format_dict["elapsed"], 1e-9)
-                bar.set_postfix_str(f"{rate:.0f} frames/s", refresh=False)
-    return path
-
-
-def make_dataset(cfg: DictConfig, path: Path, split: str, **changes: Any) -> OfflineTrajectories:
-    """One split of a dataset as clips for the model of a configuration."""
-    settings = {
-        "split": split,
-        "num_frames": cfg.model.history + 1,
-        "frame_skip": cfg.model.frame_skip,
-        "batch_size": cfg.optim.batch_size,
-        "seed": cfg.seed,
-    }
-    return OfflineTrajectories(path, **{**settings, **changes})
 
 
 def model_config(cfg: DictConfig) -> ModelConfig:
@@ -188,10 +131,14 @@ def make_policy(plan: DictConfig, model: LatentWorldModel, low: list[float], hig
     return MPCPolicy(LatentCEMPlanner(model, plan_config(plan), action_bounds=(low, high)))
 
 
-def action_bounds(env: str) -> tuple[list[float], list[float]]:
-    """Bounds of a raw action [A], environment units."""
-    space = make_env(env).full_action_spec_unbatched["action"].space
-    return space.low.tolist(), space.high.tolist()
+def evaluate_beside_random(
+    policy: MPCPolicy, pairs: StartGoalPairs, card: ModelCard, *, record: int, **settings: Any
+) -> tuple[Evaluation, Evaluation]:
+    """A policy, and uniformly random actions, on the same pairs in the environment that a model was trained on."""
+    shared = {"image_size": card.model["image_size"], "env_kwargs": card.env_kwargs, **settings}
+    outcome = evaluate_mpc(policy, pairs, record=record, description="plan", **shared)
+    floor = evaluate_mpc(UniformPolicy(card.action_low, card.action_high), pairs, description="random", **shared)
+    return outcome, floor
 
 
 def check_settings(cfg: DictConfig) -> None:
@@ -218,6 +165,8 @@ def check_settings(cfg: DictConfig) -> None:
     positive |= {"evaluation.record": evaluation.record, "logger.interval": cfg.logger.interval}
     positive |= {"logger.alarm_interval": cfg.logger.alarm_interval}
     positive |= {"optim.validation_batches": optim.validation_batches, "env.data.max_steps": cfg.env.data.max_steps}
+    if evaluation.num_workers is not None:
+        positive |= {"evaluation.num_workers": evaluation.num_workers}
     wrong = [f"{key}={value}" for key, value in positive.items() if not value > 0]
     if wrong:
         raise ValueError(f"must be positive: {', '.join(wrong)}.")
@@ -230,7 +179,7 @@ def check_settings(cfg: DictConfig) -> None:
         raise ValueError(f"optim.warmup must lie in [0, 1), got {optim.warmup}.")
     for precision in (optim.precision, cfg.plan.precision):
         uses_bf16("cpu", precision)
-    make_env(cfg.env.name, **OmegaConf.to_container(cfg.env.kwargs)).close()
+    describe_env(cfg)
 
 
 def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -11,7 +12,8 @@ from scenes import make_pairs, same_room_pairs, Walker
 
 from torchrl_ficreg import LatentCEMPlanner, make_world_model, ModelConfig, MPCPolicy, PlanConfig
 from torchrl_ficreg.envs.two_room import render
-from torchrl_ficreg.evaluation import evaluate_mpc, UniformPolicy
+from torchrl_ficreg.envs.two_room.env import TwoRoomEnv
+from torchrl_ficreg.evaluation import evaluate_mpc, save_episodes_gif, UniformPolicy
 
 BOX = ([-1.0, -1.0], [1.0, 1.0])
 
@@ -73,14 +75,16 @@ def test_the_pairs_of_a_subset_come_out_as_in_the_whole(planner):
     """The first three of seven, alone: same outcome."""
     pairs = same_room_pairs()
     few = make_pairs(pairs.start_state[:3], pairs.goal_state[:3])
-    whole, part = (evaluate(planner, which, record=3) for which in (pairs, few))
+    whole, part = (evaluate(planner, which, record=len(which)) for which in (pairs, few))
     assert all(np.array_equal(a, b) for a, b in zip(whole.frames[:3], part.frames))
 
 
 def test_worker_processes_change_nothing():
-    pairs = same_room_pairs(2)
-    here, there = (evaluate(UniformPolicy(*BOX), pairs, num_workers=n, record=2) for n in (None, 2))
-    assert all(np.array_equal(a, b) for a, b in zip(here.frames, there.frames))
+    """Six pairs, three at a time in two processes; the second three find used environments."""
+    pairs = same_room_pairs(6)
+    here, there = (evaluate(UniformPolicy(*BOX), pairs, num_workers=n, num_envs=3, record=6) for n in (None, 2))
+    assert np.array_equal(here.success, there.success)
+    assert all(np.array_equal(a, b) for a, b in zip(here.frames, there.frames, strict=True))
 
 
 def test_the_global_random_state_takes_no_part(planner):
@@ -152,13 +156,52 @@ def test_recorded_frames_are_the_rendered_states():
     """The first frame shows the start state, the last one where the walker ended, the goal the goal state."""
     pairs = same_room_pairs(5)
     outcome = evaluate(Walker(), pairs, budget=40, num_envs=2, record=3)
-    assert len(outcome.frames) == len(outcome.goals) == 3
-    for i in range(3):
-        assert outcome.frames[i].shape == (41, 3, 16, 16) and outcome.frames[i].dtype == np.uint8
-        assert np.array_equal(outcome.frames[i][0], render(torch.from_numpy(pairs.start_state[i]), size=16).numpy())
-        goal = render(torch.from_numpy(pairs.goal_state[i]), size=16).numpy()
-        assert np.array_equal(outcome.goals[i], goal)
-        assert np.abs(outcome.frames[i][-1].astype(int) - goal).max() <= 1
+    assert len(outcome.recorded) == len(outcome.frames) == len(outcome.goals) == 3
+    for row, frames, shown_goal in zip(outcome.recorded, outcome.frames, outcome.goals):
+        assert frames.shape == (41, 3, 16, 16) and frames.dtype == np.uint8
+        assert np.array_equal(frames[0], render(torch.from_numpy(pairs.start_state[row]), size=16).numpy())
+        goal = render(torch.from_numpy(pairs.goal_state[row]), size=16).numpy()
+        assert np.array_equal(shown_goal, goal)
+        assert np.abs(frames[-1].astype(int) - goal).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("record", "rows"), [(0, []), (1, [0]), (3, [0, 2, 4]), (4, [0, 1, 3, 5]), (7, list(range(7))), (9, list(range(7)))]
+)
+def test_recorded_pairs_are_spread_evenly_over_the_list(record, rows):
+    """Neighbours in the list start in the same recorded episode."""
+    outcome = evaluate(Walker(), same_room_pairs(7), budget=1, num_envs=3, record=record)
+    assert outcome.recorded == rows and len(outcome.frames) == len(outcome.goals) == len(rows)
+
+
+def test_the_gif_frames_the_successes_of_the_recorded_pairs(tmp_path):
+    """Rows 0 and 2 are shown, row 1 alone reaches its goal: no frame turns green. Rows 0 and 1: the second does."""
+    imageio = pytest.importorskip("imageio.v3")
+    starts, goals = [[60, 40]] * 4, [[60, 200], [60, 62], [60, 200], [60, 200]]
+    outcome = evaluate(Walker(stop=False), make_pairs(starts, goals), budget=3, record=2)
+    assert outcome.recorded == [0, 2] and outcome.ever.tolist() == [False, True, False, False]
+    for rows, green in (([0, 2], [False, False]), ([0, 1], [False, True])):
+        outcome.recorded = rows
+        save_episodes_gif(outcome, tmp_path / "episodes.gif", scale=1, columns=2)
+        last = imageio.imread(tmp_path / "episodes.gif", index=None)[-1].astype(int)  # [h, w, 3]
+        border = last[1, [2, last.shape[1] // 2 + 2]]  # of the left and of the right tile
+        assert (border[:, 1] > border[:, 0] + 50).tolist() == green
+
+
+def test_an_environment_that_draws_at_its_reset_is_seeded_by_the_pair():
+    """What TwoRoom would draw next depends on the pair and not on who ran before in the same environment."""
+    drawn = {}
+
+    class Spy(TwoRoomEnv):
+        def _is_success(self, state, goal_state):
+            drawn.setdefault(key, []).append(self.np_random.bit_generator.state["state"]["state"])
+            return super()._is_success(state, goal_state)
+
+    gymnasium.register("test/Spy-v0", Spy)
+    for key in (1, 4):  # noqa: B007  environments side by side
+        evaluate(Walker(), make_pairs([[60, 60]] * 4, [[60, 90]] * 4, env="test/Spy-v0"), num_envs=key, budget=1)
+    del gymnasium.registry["test/Spy-v0"]
+    assert len(set(drawn[1])) == 4 and set(drawn[1]) == set(drawn[4])
 
 
 def test_environment_arguments_arrive():
@@ -171,7 +214,15 @@ def test_environment_arguments_arrive():
     assert not np.array_equal(swept.frames[0], endpoint.frames[0])
 
 
-@pytest.mark.parametrize("setting", [{"budget": 0}, {"num_envs": 0}])
-def test_settings_out_of_range_are_refused(setting):
-    with pytest.raises(ValueError, match="must be positive"):
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"budget": 0}, "must be positive"),
+        ({"num_envs": 0}, "must be positive"),
+        ({"num_workers": 0}, "num_workers must be None or at least 1, got 0"),
+        ({"env_kwargs": {"image_size": 8}}, r"must not hold \['image_size'\]"),
+    ],
+)
+def test_settings_out_of_range_are_refused(setting, message):
+    with pytest.raises(ValueError, match=message):
         evaluate(Walker(), same_room_pairs(1), **setting)

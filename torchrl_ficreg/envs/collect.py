@@ -27,13 +27,14 @@ def collect_episodes(
     num_workers: int = 2,
     image_size: int = 64,
     max_steps: int = 100,
+    stop_at_success: bool = True,
     expert_kwargs: dict[str, Any] | None = None,
     env_kwargs: dict[str, Any] | None = None,
 ) -> Iterator[dict[str, np.ndarray]]:
     """Records the episodes ``start`` to ``num_episodes - 1`` of an environment's expert.
 
-    An episode ends at success or after ``max_steps`` actions. Row t holds frame t, the state it was drawn from and
-    the action that leads to frame t + 1; the last row has no action and holds zeros::
+    An episode ends after ``max_steps`` actions, and at success where that is asked for. Row t holds frame t, the state
+    it was drawn from and the action that leads to frame t + 1; the last row has no action and holds zeros::
 
         pixels   o_0  o_1  ...  o_n        n actions, n + 1 rows
         action   a_0  a_1  ...  0
@@ -47,6 +48,7 @@ def collect_episodes(
             a script needs the usual ``if __name__ == "__main__":``.
         image_size: height and width of the pictures, in pixels.
         max_steps: most actions of an episode.
+        stop_at_success: end an episode when its goal is reached; else all have ``max_steps`` actions.
         expert_kwargs: passed to the expert, for instance ``{"noise_std": 1.0}``.
         env_kwargs: passed to the environment.
 
@@ -77,6 +79,7 @@ def collect_episodes(
         entry=find_entry(name),
         seed=seed,
         max_steps=max_steps,
+        stop_at_success=stop_at_success,
         expert_kwargs=dict(expert_kwargs or {}),
         env_kwargs={"image_size": image_size, **(env_kwargs or {})},
     )
@@ -94,13 +97,15 @@ class EpisodeRecorder:
         entry: where the environment and its expert are found.
         seed: of the whole data set.
         max_steps: most actions of an episode.
-        expert_kwargs: passed to the expert.
+        stop_at_success: whether a reached goal ends an episode.
+        expert_kwargs: passed to the expert, beside ``rng`` and ``env``.
         env_kwargs: passed to the environment.
     """
 
     entry: EnvEntry
     seed: int
     max_steps: int
+    stop_at_success: bool
     expert_kwargs: dict[str, Any]
     env_kwargs: dict[str, Any]
     _env: GoalEnv | None = field(default=None, init=False, repr=False)
@@ -118,10 +123,10 @@ class EpisodeRecorder:
             self._env = self.entry.load_env()(**self.env_kwargs)
         env = self._env
         task_seed, expert_seed = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(2)
-        expert = self.entry.load_expert()(rng=np.random.default_rng(expert_seed), **self.expert_kwargs)
+        expert = self.entry.load_expert()(rng=np.random.default_rng(expert_seed), env=env, **self.expert_kwargs)
         observation, info = env.reset(seed=int(task_seed.generate_state(1)[0]))
         pixels, states, actions = [observation[PIXELS]], [observation[STATE]], []
-        while len(actions) < self.max_steps and not info[SUCCESS].item():
+        while len(actions) < self.max_steps and not (self.stop_at_success and info[SUCCESS].item()):
             action = expert(observation[STATE], observation[GOAL_STATE])
             observation, _, _, _, info = env.step(action)
             actions.append(action)

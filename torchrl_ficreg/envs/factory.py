@@ -8,13 +8,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 from torchrl.data import Binary, Composite
-from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv
+from torchrl.envs import EnvBase, GymWrapper, SerialEnv
 from torchrl.envs.gym_like import default_info_dict_reader
 
 from torchrl_ficreg.data.schema import STATE, SUCCESS
 from torchrl_ficreg.envs.base import GoalEnv
-from torchrl_ficreg.envs.registry import find_entry, register_all
+from torchrl_ficreg.envs.batched import WorkerGroupsEnv
+from torchrl_ficreg.envs.registry import find_entry
 
 _TORCHRL_STATE = "observation"  # what GymWrapper calls an observation named "state"
 
@@ -74,8 +76,10 @@ def make_env(
         image_size: height and width of the pictures, in pixels.
         terminate_on_success: end an episode once its goal is reached.
         max_episode_steps: truncate after so many steps; None for no limit.
-        num_workers: None to step the batch in this process; ``num_envs`` for one process, with one torch thread,
-            per environment, which pays when drawing is slow. No other number.
+        num_workers: None to step the batch in this process; W for W processes with one thread each, among which the
+            environments are divided evenly. Same results bit for bit; it pays when drawing is slow, one process per
+            core. A script then needs the usual ``if __name__ == "__main__":``. A single environment always lives in
+            this process.
         seed: makes the environments' draws reproducible; each environment of a batch gets its own seed from it.
         **env_kwargs: passed to the environment's constructor.
 
@@ -93,13 +97,13 @@ def make_env(
     """
     if num_envs < 1:
         raise ValueError(f"num_envs must be at least 1, got {num_envs}.")
-    if num_workers not in (None, num_envs):
-        raise ValueError(f"num_workers must be None or num_envs ({num_envs}: a process each), got {num_workers}.")
+    if num_workers is not None and not 1 <= num_workers <= num_envs:
+        raise ValueError(f"num_workers must be None or in 1..num_envs ({num_envs}), got {num_workers}.")
     if max_episode_steps is not None and max_episode_steps < 1:
         raise ValueError(f"max_episode_steps must be at least 1, or None for no limit, got {max_episode_steps}.")
     create = functools.partial(
         _make_single,
-        _gym_id(name),
+        _gym_spec(name),
         max_episode_steps,
         image_size=image_size,
         terminate_on_success=terminate_on_success,
@@ -110,17 +114,17 @@ def make_env(
     elif num_workers is None:
         env = SerialEnv(num_envs, create)
     else:
-        env = ParallelEnv(num_envs, create, num_sub_threads=1)
+        env = WorkerGroupsEnv(num_envs, create, num_workers)
     if seed is not None:
         env.set_seed(seed)
     return env
 
 
-def _make_single(gym_id: str, max_episode_steps: int | None, **kwargs: Any) -> GoalGymWrapper:
-    register_all()  # a worker process that unpickles only this function has registered nothing yet
+def _make_single(gym_spec: EnvSpec, max_episode_steps: int | None, **kwargs: Any) -> GoalGymWrapper:
     limit = -1 if max_episode_steps is None else max_episode_steps  # Gymnasium's None means the id's own limit
-    return GoalGymWrapper(gymnasium.make(gym_id, max_episode_steps=limit, disable_env_checker=True, **kwargs))
+    return GoalGymWrapper(gymnasium.make(gym_spec, max_episode_steps=limit, disable_env_checker=True, **kwargs))
 
 
-def _gym_id(name: str) -> str:
-    return name if name in gymnasium.registry else find_entry(name).gym_id
+def _gym_spec(name: str) -> EnvSpec:
+    """The whole entry, not its id: a worker process has not seen what the caller registered."""
+    return gymnasium.spec(name if name in gymnasium.registry else find_entry(name).gym_id)

@@ -36,7 +36,7 @@ class EnvEntry:
         gym_id: its Gymnasium id.
         entry_point: the :class:`~torchrl_ficreg.envs.base.GoalEnv` subclass.
         expert: the :class:`Expert` that records its data, built anew for each episode as ``expert(rng=generator,
-            **expert_kwargs)``.
+            env=env, **expert_kwargs)``; the environment is there to be asked about its scene, not to be stepped.
         max_episode_steps: the time limit of ``gymnasium.make(gym_id)``.
     """
 
@@ -65,6 +65,24 @@ ENVIRONMENTS: dict[str, EnvEntry] = {
         entry_point="torchrl_ficreg.envs.two_room.env:TwoRoomEnv",
         expert="torchrl_ficreg.envs.two_room.expert:TwoRoomExpert",
         max_episode_steps=100,
+    ),
+    "push_t": EnvEntry(
+        gym_id="torchrl_ficreg/PushT-v0",
+        entry_point="torchrl_ficreg.envs.push_t.env:PushTEnv",
+        expert="torchrl_ficreg.envs.push_t.expert:PushTExpert",
+        max_episode_steps=200,
+    ),
+    "reacher": EnvEntry(
+        gym_id="torchrl_ficreg/Reacher-v0",
+        entry_point="torchrl_ficreg.envs.reacher.env:ReacherEnv",
+        expert="torchrl_ficreg.envs.reacher.expert:ReacherExpert",
+        max_episode_steps=200,
+    ),
+    "cube": EnvEntry(
+        gym_id="torchrl_ficreg/Cube-v0",
+        entry_point="torchrl_ficreg.envs.cube.env:CubeEnv",
+        expert="torchrl_ficreg.envs.cube.expert:CubeExpert",
+        max_episode_steps=200,
     ),
 }
 

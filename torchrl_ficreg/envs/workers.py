@@ -21,6 +21,8 @@ from typing import Any, TypeVar
 
 import torch
 
+from torchrl_ficreg.envs.process_env import environment_variables, ONE_THREAD
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -49,12 +51,13 @@ def ordered_map(
     context = multiprocessing.get_context("spawn")  # a forked child would inherit torch's threads half-alive
     workers: dict[Connection, BaseProcess] = {}
     try:
-        for _ in range(num_workers):
-            ours, theirs = context.Pipe()
-            process = context.Process(target=_work, args=(function, theirs), daemon=True)
-            process.start()
-            theirs.close()  # else a dead worker's pipe would look open
-            workers[ours] = process
+        with environment_variables(ONE_THREAD):
+            for _ in range(num_workers):
+                ours, theirs = context.Pipe()
+                process = context.Process(target=_work, args=(function, theirs), daemon=True)
+                process.start()
+                theirs.close()  # else a dead worker's pipe would look open
+                workers[ours] = process
         yield from _exchange(workers, enumerate(items))
     finally:
         _shut_down(workers)

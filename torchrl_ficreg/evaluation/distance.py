@@ -72,7 +72,8 @@ def latent_distance(
     picks = np.sort(np.random.default_rng(seed).choice(total, min(num_frames, total), replace=False))
     rows = torch.searchsorted(ends, torch.from_numpy(picks), right=True)
     steps = torch.from_numpy(picks) - (ends - table["length"])[rows]
-    frames = [dataset.episode_data(int(table["episode"][r]))[int(s)] for r, s in zip(rows, steps)]
+    places = [(int(table["episode"][r]), slice(int(s), int(s) + 1)) for r, s in zip(rows, steps)]
+    frames = [dataset.episode_data(episode, steps=step)[0] for episode, step in places]
     state = torch.stack([frame[STATE] for frame in frames])  # [N, S]
     device = model.action_mean.device
     chunks = torch.stack([frame[PIXELS] for frame in frames]).split(64)

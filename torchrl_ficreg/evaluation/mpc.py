@@ -56,13 +56,15 @@ class Evaluation:
         success: [N, budget + 1] bool, at the start and after every step.
         seconds_per_plan: mean wall time of one plan of one environment; 0 for a policy that does not plan.
         pairs_hash: of the pairs.
-        frames: recorded episodes, each [budget + 1, 3, H, W] uint8.
+        recorded: rows of the pairs whose episodes were recorded, ascending.
+        frames: these episodes, each [budget + 1, 3, H, W] uint8.
         goals: their goals, each [3, H, W] uint8.
     """
 
     success: np.ndarray
     seconds_per_plan: float
     pairs_hash: str
+    recorded: list[int] = field(default_factory=list)
     frames: list[np.ndarray] = field(default_factory=list)
     goals: list[np.ndarray] = field(default_factory=list)
 
@@ -115,8 +117,9 @@ def evaluate_mpc(
 ) -> Evaluation:
     """Lets a policy act from every start state and counts the goals it reaches.
 
-    Episodes go on after success, so that reaching a goal and staying there are counted separately. An outcome does not
-    depend on ``num_envs``: the policy is told, by ``plan_seed``, which pair it acts for.
+    Episodes go on after success, so that reaching a goal and staying there are counted separately; an environment that
+    stopped at its goal would count as one that stays. An outcome depends neither on ``num_envs`` nor on
+    ``num_workers``: the policy is told, by ``plan_seed``, which pair it acts for, and the environment is seeded by it.
 
     Args:
         policy: reads ``pixels`` and ``goal_pixels``, writes ``action``.
@@ -124,35 +127,49 @@ def evaluate_mpc(
         budget: environment steps allowed.
         image_size: of the frames the policy sees.
         num_envs: pairs evaluated side by side.
-        num_workers: see :func:`~torchrl_ficreg.envs.make_env`.
+        num_workers: None to step the environments in this process; W to divide them among W processes, or among as
+            many as there are environments, see :func:`~torchrl_ficreg.envs.make_env`.
         env_kwargs: further arguments of the environment.
-        record: number of episodes whose frames are kept.
+        record: number of episodes whose frames are kept, k of N: rows 0, N / k, 2 N / k, ... rounded down, since
+            neighbours in the list often come from one recorded episode; at most N.
         progress_bar, description: of the progress bar.
 
     Raises:
-        ValueError: a budget below 1.
+        ValueError: ``budget`` or ``num_envs`` below 1, ``num_workers`` too, or ``env_kwargs`` that are set here.
     """
     if budget < 1 or num_envs < 1:
         raise ValueError(f"budget and num_envs must be positive, got {budget} and {num_envs}.")
-    outcome = Evaluation(np.zeros((len(pairs), budget + 1), dtype=bool), 0.0, pairs.hash)
+    if num_workers is not None and num_workers < 1:
+        raise ValueError(f"num_workers must be None or at least 1, got {num_workers}.")
+    taken = {"image_size", "terminate_on_success", "num_envs", "num_workers", "seed"} & set(env_kwargs or {})
+    if taken:
+        raise ValueError(f"env_kwargs must not hold {sorted(taken)}: evaluate_mpc sets them.")
+    shown = min(record, len(pairs))
+    recorded = [len(pairs) * i // shown for i in range(shown)]
+    outcome = Evaluation(np.zeros((len(pairs), budget + 1), dtype=bool), 0.0, pairs.hash, recorded)
     seconds, plans = 0.0, 0
     bar = tqdm(total=len(pairs) * budget, desc=description, unit="step", disable=not progress_bar, dynamic_ncols=True)
-    for first in range(0, len(pairs), num_envs):
-        group = np.arange(first, min(first + num_envs, len(pairs)))
-        env = make_env(
-            pairs.env,
-            len(group),
-            image_size=image_size,
-            terminate_on_success=False,
-            num_workers=None if num_workers is None else len(group),
-            **(env_kwargs or {}),
-        )
-        try:
-            group_seconds, group_plans = _run_group(env, policy, pairs, group, outcome, record, bar)
-        finally:
-            env.close()
-        seconds, plans = seconds + group_seconds, plans + group_plans
-    bar.close()
+    env = None
+    try:
+        for first in range(0, len(pairs), num_envs):
+            group = np.arange(first, min(first + num_envs, len(pairs)))
+            if env is None or env.numel() != len(group):  # all groups but the last share one: processes start slowly
+                if env is not None:
+                    env.close()
+                env = make_env(
+                    pairs.env,
+                    len(group),
+                    image_size=image_size,
+                    terminate_on_success=False,
+                    num_workers=None if num_workers is None else min(num_workers, len(group)),
+                    **(env_kwargs or {}),
+                )
+            group_seconds, group_plans = _run_group(env, policy, pairs, group, outcome, bar)
+            seconds, plans = seconds + group_seconds, plans + group_plans
+    finally:
+        if env is not None:
+            env.close(raise_if_closed=False)
+        bar.close()
     outcome.seconds_per_plan = seconds / plans if plans else 0.0
     return outcome
 
@@ -163,22 +180,20 @@ def _run_group(
     pairs: StartGoalPairs,
     group: np.ndarray,
     outcome: Evaluation,
-    record: int,
     bar: tqdm,
 ) -> tuple[float, int]:
     """Runs the pairs of one group side by side and fills in their rows; returns policy seconds and plans made."""
-    options = [{"state": pairs.start_state[i], "goal_state": pairs.goal_state[i]} for i in group]
-    if env.batch_size:
-        td = env.reset(list_of_kwargs=[{"options": option} for option in options])
-    else:
-        td = env.reset(options=options[0])
+    scenes = [
+        {"seed": int(i), "options": {"state": pairs.start_state[i], "goal_state": pairs.goal_state[i]}} for i in group
+    ]
+    td = env.reset(list_of_kwargs=scenes) if env.batch_size else env.reset(**scenes[0])
     lead = td.batch_size
     td[PLAN_SEED] = torch.from_numpy(group).reshape(lead)
-    kept = range(max(0, min(record - int(group[0]), len(group))))
+    kept = [row - int(group[0]) for row in outcome.recorded if row in group]
 
     def pictures(key: str) -> np.ndarray:
         """Copies of the recorded environments' pictures, [kept, 3, H, W]."""
-        return td[key].reshape(len(group), *td[key].shape[-3:])[: len(kept)].numpy().copy()
+        return td[key].reshape(len(group), *td[key].shape[-3:])[kept].numpy()
 
     frames = [pictures(PIXELS)]
     outcome.goals += list(pictures(GOAL_PIXELS))
@@ -193,6 +208,6 @@ def _run_group(
         if kept:
             frames.append(pictures(PIXELS))
         bar.update(len(group))
-    outcome.frames += [np.stack([frame[i] for frame in frames]) for i in kept]
+    outcome.frames += list(np.stack(frames, axis=1)) if kept else []
     plans = td.get(("mpc", "count"), None)
     return seconds, 0 if plans is None else int(plans.sum())

@@ -72,7 +72,8 @@ class StartGoalPairs:
         row = np.searchsorted(ends, picks, side="right")  # [N], row of the episode table
         step = picks - (ends - starts)[row]
         episode = table["episode"].numpy()[row]
-        states = [dataset.episode_data(int(e))[STATE].numpy()[[s, s + goal_offset]] for e, s in zip(episode, step)]
+        state = {int(e): dataset.episode_data(int(e), keys=(STATE,))[STATE].numpy() for e in episode}
+        states = [state[int(e)][[s, s + goal_offset]] for e, s in zip(episode, step)]
         start_state, goal_state = np.stack(states, axis=1)  # each [N, S]
         return cls(env, goal_offset, seed, dataset.fingerprint, episode, step, start_state, goal_state)
 

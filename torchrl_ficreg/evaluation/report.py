@@ -103,8 +103,8 @@ def save_episodes_gif(evaluation: Evaluation, target: Path, *, scale: int = 2, f
     pictures = []
     for step in range(len(evaluation.frames[0])):
         tiles = [
-            _tile(frames[step], goal, bool(reached[i, step]), scale)
-            for i, (frames, goal) in enumerate(zip(evaluation.frames, evaluation.goals))
+            _tile(frames[step], goal, bool(reached[row, step]), scale)
+            for row, frames, goal in zip(evaluation.recorded, evaluation.frames, evaluation.goals)
         ]
         tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
         rows = [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)]

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from torchrl_ficreg.envs.two_room.dynamics import TWO_ROOM, TwoRoomGeometry
+from torchrl_ficreg.envs.two_room.dynamics import TWO_ROOM
+
+if TYPE_CHECKING:
+    from torchrl_ficreg.envs.two_room.env import TwoRoomEnv
 
 SWITCH_DISTANCE = 10.5  # px from the door centre at which the agent turns to the goal
 
@@ -21,7 +26,7 @@ class TwoRoomExpert:
         noise_std: standard deviation of the noise per component, in actions. The published data have 2.0: 63 % of
             the components then sit at a bound.
         rng: the source of the noise; a fixed one by default, so that equal calls give equal episodes.
-        geometry: the scene.
+        env: the environment whose scene it walks; the default scene without one.
 
     Raises:
         ValueError: ``noise_std`` is negative or not finite.
@@ -37,12 +42,12 @@ class TwoRoomExpert:
         *,
         noise_std: float = 2.0,
         rng: np.random.Generator | None = None,
-        geometry: TwoRoomGeometry = TWO_ROOM,
+        env: TwoRoomEnv | None = None,
     ) -> None:
         if not 0 <= noise_std < np.inf:
             raise ValueError(f"noise_std must be finite and not negative, got {noise_std}.")
         self.noise_std = noise_std
-        self.geometry = geometry
+        self.geometry = TWO_ROOM if env is None else env.geometry
         self._rng = np.random.default_rng(0) if rng is None else rng
 
     def __call__(self, state: np.ndarray, goal_state: np.ndarray) -> np.ndarray:

@@ -1,0 +1,53 @@
+"""Turns other people's data into a dataset: python convert.py source=pusht_expert_train.h5 target=data/pusht env=push_t.
+
+Run again after an interruption, it continues.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+from cli import entry_point
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from torchrl_ficreg.data import EpisodeStore
+from torchrl_ficreg.data.convert import convert, open_source
+
+
+@entry_point("convert")
+def main(cfg: DictConfig) -> None:
+    """Converts what is missing and says what is there."""
+    # One line without the source of the warning, which is ours.
+    warnings.showwarning = lambda message, *_: print(f"warning: {message}")
+    if cfg.env_name and "env" in cfg:
+        raise ValueError(f"env_name={cfg.env_name} is for environments other than env={cfg.env.name}: give one of them.")
+    if (cfg.action_low is None) != (cfg.action_high is None):
+        raise ValueError("give both action_low and action_high, or none of them.")
+    task = OmegaConf.to_container(cfg.env) if "env" in cfg else {"name": cfg.env_name, "kwargs": {}}
+    state = list(cfg.state) if isinstance(cfg.state, ListConfig) else cfg.state
+    with open_source(
+        cfg.source,
+        cfg.format,
+        env=task["name"],
+        state=state,
+        pixels=cfg.pixels,
+        action=cfg.action,
+        shift=cfg.shift,
+        allow_incomplete=cfg.allow_incomplete,
+    ) as source:
+        path = convert(
+            source,
+            cfg.target,
+            env_kwargs=task["kwargs"],
+            action_bounds=None if cfg.action_low is None else (cfg.action_low, cfg.action_high),
+            frames=cfg.frames,
+            image_size=cfg.image_size,
+            limit=cfg.limit,
+            check_alignment=cfg.check_alignment,
+        )
+    store = EpisodeStore.open(path)
+    print(f"{path}: {store.num_episodes} episodes, {store.num_steps} steps")
+
+
+if __name__ == "__main__":
+    main()

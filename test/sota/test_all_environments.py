@@ -1,0 +1,33 @@
+"""train.py runs its whole path on every environment: data, training, planning, report, each of it tiny."""
+
+from __future__ import annotations
+
+import json
+
+import imageio.v3 as imageio
+import pytest
+
+from torchrl_ficreg.envs.gl import gl_works
+
+ACTION_DIM = {"push_t": 2, "reacher": 2, "cube": 5}
+SHORT = ["env.data.max_steps=30", "env.budget=26", "evaluation.num_pairs=2", "evaluation.record=1"]
+
+
+@pytest.mark.parametrize("env", ACTION_DIM)
+def test_the_whole_path(env, execute, tmp_path):
+    if env != "push_t" and not gl_works():
+        pytest.skip("MuJoCo has no GL to draw with: apt-get install libegl1 libgl1")
+    done = execute(tmp_path, "train.py", f"env={env}", *SHORT)
+    assert done.returncode == 0, done.stderr
+    (run,) = (tmp_path / "runs").iterdir()
+    results = json.loads((run / "results.json").read_text())
+    assert run.name == f"{env}_cpu_ficreg_seed0"
+    for policy in ("ficreg", "random"):
+        assert results[policy]["pairs"] == 2 and 0 <= results[policy]["success_rate"] <= 1
+    frames = imageio.imread(run / "episodes.gif")
+    assert frames.ndim == 4 and frames.std() > 5
+    (data,) = (tmp_path / "data").iterdir()
+    header = json.loads((data / "meta.json").read_text())
+    assert header["shapes"]["action"] == [ACTION_DIM[env]]
+    lengths = [json.loads(line)["length"] for line in (data / "episodes.jsonl").read_text().splitlines()]
+    assert lengths == [31] * 20, "episodes of these environments do not end at success"

@@ -1,0 +1,12 @@
+"""Cube: a robot arm and a cube; simulator, meshes, pictures, tasks, expert and environment, each in its own file."""
+
+from __future__ import annotations
+
+from torchrl_ficreg.envs.cube.arm import CubeArm
+from torchrl_ficreg.envs.cube.env import CubeEnv
+from torchrl_ficreg.envs.cube.expert import CubeExpert
+from torchrl_ficreg.envs.cube.poses import cube_angle
+from torchrl_ficreg.envs.cube.rendering import render
+from torchrl_ficreg.envs.cube.tasks import sample_goal, sample_start
+
+__all__ = ["CubeArm", "CubeEnv", "CubeExpert", "cube_angle", "render", "sample_goal", "sample_start"]

@@ -1,0 +1,107 @@
+"""dm_control's reacher as a goal-conditioned Gymnasium environment, its goals being joint angles."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+
+from torchrl_ficreg.envs.base import GoalEnv
+from torchrl_ficreg.envs.gl import OffscreenRenderer, import_mujoco
+from torchrl_ficreg.envs.reacher import physics
+
+
+class ReacherEnv(GoalEnv):
+    """Turn the two joints of a planar arm by their motors until both angles are those of the goal.
+
+    State: shoulder and wrist in rad, then their velocities in rad/s, [4] float64; the shoulder winds without limit.
+    Action: the motors' shares of their torque of 0.05 N m, [2], obeyed up to +-1; it lasts two control steps of
+    0.02 s. An episode starts at rest, the shoulder uniform over the circle and the wrist within +-160 degrees, and so
+    does its goal. Success: each angle within 0.05 rad of its goal, whatever the velocities. Pictures: seen from
+    above, without dm_control's target, and without the velocities.
+
+    Success is tested after each control step, and the action that first reaches the goal of an episode ends there,
+    half done if need be, as in the published environment: the state then is the one that reached the goal. There is
+    no end of the episode by time, however many steps are taken.
+
+    Args:
+        wrap: compare the shoulder's angle modulo 2 pi, because a picture does not show turns. False is the published
+            rule, by which an arm that looks right may be wrong.
+        stop_within_action: False to test success after whole actions only and to leave none half done, as recordings
+            want it.
+        shadow_size: resolution of the shadow map. 512 instead of dm_control's 2048 makes software rendering about
+            twice as fast and changes about 1 in 1000 values of a picture.
+        **kwargs: of :class:`~torchrl_ficreg.envs.base.GoalEnv`.
+
+    Raises:
+        ValueError: an argument out of range.
+        ImportError: MuJoCo or dm_control is not installed.
+
+    Examples:
+        >>> env = ReacherEnv(image_size=64)
+        >>> env.action_space.shape, env.state_space.shape, env.observation_space["pixels"].shape
+        ((2,), (4,), (3, 64, 64))
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 25}
+
+    def __init__(
+        self, *, wrap: bool = True, stop_within_action: bool = True, shadow_size: int = 2048, **kwargs: Any
+    ) -> None:
+        if not isinstance(shadow_size, int) or shadow_size < 1:
+            raise ValueError(f"shadow_size must be a positive integer, got {shadow_size!r}.")
+        self.wrap = wrap
+        self.stop_within_action = stop_within_action
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        highest = np.array([np.inf, physics.WRIST_LIMIT + physics.WRIST_SLACK, np.inf, np.inf])
+        self.state_space = spaces.Box(-highest, highest, dtype=np.float64)
+        super().__init__(**kwargs)
+        self._mujoco = import_mujoco()
+        self._model = physics.load_model()
+        self._model.vis.quality.shadowsize = shadow_size
+        self._data = self._mujoco.MjData(self._model)
+        self._drawn = self._mujoco.MjData(self._model)  # the scene in the picture: drawing leaves the arm alone
+        self._renderer = OffscreenRenderer(self._model, self.image_size)
+        self._reached = False  # in this episode; the start does not count
+
+    def close(self) -> None:
+        """Gives the renderer's resources back; drawing again takes new ones."""
+        self._renderer.close()
+
+    def _sample_state(self, rng: np.random.Generator) -> np.ndarray:
+        return physics.sample_state(rng)
+
+    def _sample_goal(self, rng: np.random.Generator, state: np.ndarray) -> np.ndarray:
+        return physics.sample_state(rng)
+
+    def _get_state(self) -> np.ndarray:
+        return np.concatenate([self._data.qpos, self._data.qvel])
+
+    def _set_state(self, state: np.ndarray) -> None:
+        self._mujoco.mj_resetData(self._model, self._data)  # time, motors and what the solver remembers
+        self._data.qpos[:] = state[:2]
+        self._data.qvel[:] = state[2:]
+        self._reached = False
+
+    def _step_physics(self, action: np.ndarray) -> None:
+        self._data.ctrl[:] = action
+        for _ in range(physics.CONTROL_STEPS):
+            self._mujoco.mj_step(self._model, self._data)
+            if self.stop_within_action and not self._reached and self._is_success(self._get_state(), self._goal_state):
+                self._reached = True
+                return
+
+    def _draw(self, state: np.ndarray) -> np.ndarray:
+        self._drawn.qpos[:] = state[:2]
+        self._mujoco.mj_forward(self._model, self._drawn)
+        return self._renderer.draw(self._drawn, physics.CAMERA)
+
+    def _is_success(self, state: np.ndarray, goal_state: np.ndarray) -> bool:
+        return bool(physics.is_success(state, goal_state, wrap=self.wrap))
+
+    def _why_illegal(self, state: np.ndarray) -> str | None:
+        limit = physics.WRIST_LIMIT + physics.WRIST_SLACK
+        if abs(state[1]) <= limit:
+            return None
+        return f"the wrist's stop at +-{physics.WRIST_LIMIT:.4f} rad never yields beyond +-{limit:.4f} rad"

@@ -56,11 +56,12 @@ def collect_dataset(cfg: DictConfig) -> Path:
         "action_high": high,
     }
     # Several runs may be started at once: one of them records, the others wait for it.
-    with EpisodeWriter(path, target_episodes=data.episodes, meta=meta, wait=True) as writer:
+    frames = cfg.collect.frames
+    with EpisodeWriter(path, target_episodes=data.episodes, meta=meta, frames=frames, wait=True) as writer:
         if writer.complete:
             return path
         steps = (data.episodes - writer.num_episodes) * (data.max_steps + 1)
-        require_space(path, estimate_bytes(steps, cfg.model.image_size, len(low), state_size))
+        require_space(path, estimate_bytes(steps, cfg.model.image_size, len(low), state_size, frames=frames))
         episodes = collect_episodes(
             cfg.env.name,
             data.episodes,

@@ -36,6 +36,9 @@ from torchrl_ficreg.modules.precision import uses_bf16
 from torchrl_ficreg.trainers import CoefficientSchedule, LatentAlarm, ModelCard, OfflineTrainer
 
 
+SIGREG_FALL = 0.8  # share of training after which lambda has its last value
+
+
 def get_device(name: str) -> torch.device:
     """The device a configuration names.
 
@@ -59,14 +62,15 @@ def model_config(cfg: DictConfig) -> ModelConfig:
 
 def make_loss(cfg: DictConfig, model: LatentWorldModel, inverse_model: InverseDynamicsModel) -> LeWMLoss:
     """The loss of a configuration's ``method``."""
-    networks, weights = (model.encoder, model.predictor, inverse_model), cfg.loss
+    networks = (model.encoder, model.predictor, inverse_model)
+    weights = {key: value for key, value in cfg.loss.items() if key != "sigreg_start"}
     settings = {key: value for key, value in cfg.method.items() if key not in ("name", "consistency_warmup")}
     sigreg = SIGReg(seed=cfg.seed).to(next(model.parameters()).device)
     if cfg.method.name == "lewm":
-        return LeWMLoss(*networks[:2], sigreg=sigreg, sigreg_coeff=weights.sigreg_coeff)
+        return LeWMLoss(*networks[:2], sigreg=sigreg, sigreg_coeff=cfg.loss.sigreg_coeff)
     if cfg.method.name == "joint_inverse":
         return JointInverseLoss(
-            *networks, sigreg=sigreg, sigreg_coeff=weights.sigreg_coeff, idm_coeff=weights.idm_coeff
+            *networks, sigreg=sigreg, sigreg_coeff=cfg.loss.sigreg_coeff, idm_coeff=cfg.loss.idm_coeff
         )
     if cfg.method.name == "pldm":
         return PLDMLoss(*networks, **settings)
@@ -74,8 +78,14 @@ def make_loss(cfg: DictConfig, model: LatentWorldModel, inverse_model: InverseDy
 
 
 def add_hooks(cfg: DictConfig, trainer: OfflineTrainer) -> None:
-    """The alarm, and the warm-up of FICReg's coefficient where one is asked for."""
+    """The alarm, and the schedules of coefficients where they are asked for."""
     LatentAlarm(cfg.logger.alarm_interval, cfg.optim.precision, trainer.metrics_table).register(trainer)
+    start, end = cfg.loss.sigreg_start, cfg.loss.sigreg_coeff
+    if start is not None and cfg.method.name != "pldm":  # which has no SIGReg
+        fall = CoefficientSchedule(
+            "sigreg_coeff", lambda done: start * (end / start) ** min(1.0, done / SIGREG_FALL), trainer.total_steps
+        )
+        fall.register(trainer)
     share = cfg.method.get("consistency_warmup", 0.0)
     if share > 0:
         full = cfg.loss.consistency_coeff
@@ -155,6 +165,11 @@ def check_settings(cfg: DictConfig) -> None:
         raise ValueError(f"unknown logger.backend {cfg.logger.backend!r}: choose csv, wandb or tensorboard.")
     model, inverse_model = make_world_model(model_config(cfg), action_dim=1)
     make_loss(cfg, model, inverse_model)
+    if cfg.loss.sigreg_start is not None and not (cfg.loss.sigreg_start > 0 and cfg.loss.sigreg_coeff > 0):
+        raise ValueError(
+            "loss.sigreg_start and loss.sigreg_coeff must be positive to fall from one to the other, got "
+            f"{cfg.loss.sigreg_start} and {cfg.loss.sigreg_coeff}."
+        )
     if not 0 <= cfg.method.get("consistency_warmup", 0.0) <= 1:
         raise ValueError(f"method.consistency_warmup must lie in [0, 1], got {cfg.method.consistency_warmup}.")
     optim, evaluation = cfg.optim, cfg.evaluation

@@ -34,7 +34,7 @@ def edit(file, old, new):
         ("episodes.jsonl", b'"start": 20', b'"start": 21', "expected episode 2 at row 20"),
         ("episodes.jsonl", b'"length": 22', b'"length": 99', "damaged: .* bytes, the index needs"),
         ("episodes.jsonl", b'"length": 20', b'"length": "a"', "line 1 holds"),
-        ("meta.json", b'"version": 1', b'"version": 2', "format version 2, this code reads 1"),
+        ("meta.json", b'"version": 1', b'"version": 3', "format version 3, this code reads 1 and 2"),
         ("meta.json", b"{", b"", "is not the header"),
         ("meta.json", b'"shapes"', b'"shape"', "lacks or garbles the field 'shapes'"),
     ],

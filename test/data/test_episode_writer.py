@@ -1,4 +1,4 @@
-"""Claims about recording.
+"""Claims about recording, with raw and with compressed frames.
 
 1.  Killed at any system call, even in the middle of a write, a collection loses at most the episode being
     written; what remains opens, is intact, and running the collection again ends in the very bytes of an
@@ -26,21 +26,32 @@ import pytest
 
 from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, estimate_bytes
 
-FILES = ("meta.json", "episodes.jsonl", "pixels.memmap", "action.memmap", "state.memmap")
+TEXT = {"meta.json", "episodes.jsonl"}
+DATA = {
+    "raw": {"pixels.memmap", "action.memmap", "state.memmap"},
+    "webp": {"pixels.blob", "pixels.offsets", "action.memmap", "state.memmap"},
+}
 SYSTEM_CALLS = ("write", "fsync", "replace", "ftruncate")
 fork = multiprocessing.get_context("fork")  # the child inherits the imports: milliseconds instead of seconds
 
 
 def content(path):
-    return {name: (path / name).read_bytes() for name in FILES}
+    return {file.name: file.read_bytes() for file in path.iterdir() if file.suffix != ".tmp"}
+
+
+@pytest.fixture(params=["raw", "webp"])
+def frames(request):
+    if request.param != "raw":
+        pytest.importorskip("PIL", reason="compressed frames need Pillow")
+    return request.param
 
 
 @pytest.fixture
-def collect(make_episode, meta):
+def collect(make_episode, meta, frames):
     """A collection in which episode k depends on k alone, as a real one depends on (seed, k)."""
 
     def collect(path, target=4, pause=0.0):
-        with EpisodeWriter(path, target_episodes=target, meta=meta) as writer:
+        with EpisodeWriter(path, target_episodes=target, meta=meta, frames=frames) as writer:
             for number in range(writer.num_episodes + 1, target + 1):
                 writer.append(make_episode(number, length=10 + number))
                 time.sleep(pause)
@@ -92,32 +103,36 @@ def check_prefix(path, make_episode):
         return 0
     for number in range(1, store.num_episodes + 1):
         want = make_episode(number, length=10 + number)
-        for key, array in store.arrays.items():
-            np.testing.assert_array_equal(array[store.rows(number)], want[key])
+        rows = store.rows(number)
+        np.testing.assert_array_equal(store.frames(rows), want["pixels"])
+        for key in ("action", "state"):
+            np.testing.assert_array_equal(store.arrays[key][rows], want[key])
     return store.num_episodes
 
 
-def test_a_kill_at_any_system_call_loses_at_most_the_current_episode(tmp_path, collect, make_episode):
-    collect(tmp_path / "unbroken")
+def test_a_kill_at_any_system_call_loses_at_most_the_current_episode(tmp_path, collect, make_episode, frames):
+    target = 4 if frames == "raw" else 2
+    collect(tmp_path / "unbroken", target)
     unbroken = content(tmp_path / "unbroken")
     survived = []
     for call in range(1, 200):
         path = tmp_path / f"killed_{call}"
-        exit_code = run_killed(kill_at, call, collect, path)
+        exit_code = run_killed(kill_at, call, collect, path, target)
         survived.append(check_prefix(path, make_episode))
-        collect(path)
+        collect(path, target)
         assert content(path) == unbroken, f"killed at system call {call}"
         if exit_code == 0:
             break
-    assert exit_code == 0 and call > 4 * 8  # each episode has 4 writes and 4 fsyncs
-    assert survived == sorted(survived) and set(survived) == {0, 1, 2, 3, 4}
+    assert exit_code == 0 and call > target * 2 * (len(DATA[frames]) + 1)  # a write and an fsync of each file
+    assert survived == sorted(survived) and set(survived) == set(range(target + 1))
 
 
-def test_a_kill_while_resuming_is_harmless_too(tmp_path, collect, make_episode):
+def test_a_kill_while_resuming_is_harmless_too(tmp_path, collect, make_episode, frames):
     collect(tmp_path / "unbroken")
     path = tmp_path / "killed"
     attempts, before = 0, 0
-    while run_killed(kill_at, 13, collect, path):  # far enough to commit one episode at a time, or to die resuming
+    resuming, episode = len(DATA[frames]) + 1, 2 * (len(DATA[frames]) + 1)  # system calls
+    while run_killed(kill_at, resuming + episode + 1, collect, path):  # commits one at a time, or dies resuming
         episodes = check_prefix(path, make_episode)
         assert episodes >= before
         before, attempts = episodes, attempts + 1
@@ -145,7 +160,7 @@ def test_random_kills_never_break_or_duplicate(tmp_path, collect, make_episode):
 
 
 @pytest.mark.parametrize("call", range(1, 9))
-def test_a_full_disk_leaves_the_committed_episodes(tmp_path, collect, make_episode, meta, monkeypatch, call):
+def test_a_full_disk_leaves_the_committed_episodes(tmp_path, collect, make_episode, meta, monkeypatch, frames, call):
     collect(tmp_path / "unbroken", 3)
     write, count = os.write, 0
 
@@ -159,7 +174,7 @@ def test_a_full_disk_leaves_the_committed_episodes(tmp_path, collect, make_episo
 
     path = tmp_path / "full"
     monkeypatch.setattr(os, "write", full)
-    with EpisodeWriter(path, target_episodes=3, meta=meta) as writer:
+    with EpisodeWriter(path, target_episodes=3, meta=meta, frames=frames) as writer:
         while not writer.complete:
             episode = make_episode(writer.num_episodes + 1, length=11 + writer.num_episodes)
             try:
@@ -171,10 +186,11 @@ def test_a_full_disk_leaves_the_committed_episodes(tmp_path, collect, make_episo
     assert content(path) == content(tmp_path / "unbroken")
 
 
-def test_rows_are_on_disk_before_their_index_line_is_written(tmp_path, make_episode, meta, monkeypatch):
-    with EpisodeWriter(tmp_path, target_episodes=2, meta=meta) as writer:
+def test_rows_are_on_disk_before_their_index_line_is_written(tmp_path, make_episode, meta, monkeypatch, frames):
+    with EpisodeWriter(tmp_path, target_episodes=2, meta=meta, frames=frames) as writer:
         writer.append(make_episode(1))
-        names = {(tmp_path / name).stat().st_ino: name for name in FILES}
+        names = {file.stat().st_ino: file.name for file in tmp_path.iterdir()}
+        assert set(names.values()) == TEXT | DATA[frames]
         log = []
         for call in ("write", "fsync"):
             original = getattr(os, call)
@@ -185,10 +201,10 @@ def test_rows_are_on_disk_before_their_index_line_is_written(tmp_path, make_epis
 
             monkeypatch.setattr(os, call, logged)
         writer.append(make_episode(2))
-    data = [name for name in FILES if name.endswith(".memmap")]
-    assert sorted(log[:3]) == sorted(("write", name) for name in data)
-    assert sorted(log[3:6]) == sorted(("fsync", name) for name in data)
-    assert log[6:] == [("write", "episodes.jsonl"), ("fsync", "episodes.jsonl")]
+    data, count = DATA[frames], len(DATA[frames])
+    assert sorted(log[:count]) == sorted(("write", name) for name in data)
+    assert sorted(log[count : 2 * count]) == sorted(("fsync", name) for name in data)
+    assert log[2 * count :] == [("write", "episodes.jsonl"), ("fsync", "episodes.jsonl")]
 
 
 def test_a_second_writer_is_refused_until_the_first_is_gone(tmp_path, make_episode, meta):
@@ -252,6 +268,13 @@ def test_meta_survives_json(tmp_path, make_episode):
     assert header.meta == {"action_low": [-1.0, -np.inf], "size": [4, 4], "seed": 3, "path": str(tmp_path)}
     with pytest.raises(TypeError, match="got a object"):
         EpisodeWriter(tmp_path / "e", target_episodes=1, meta={"expert": object()})
+
+
+def test_the_order_of_nested_settings_does_not_matter(tmp_path, make_episode):
+    for expert in ({"noise": 1, "kind": "a"}, {"kind": "a", "noise": 1}):
+        with EpisodeWriter(tmp_path, target_episodes=2, meta={"expert": expert}) as writer:
+            writer.append(make_episode(writer.num_episodes))
+    assert writer.complete
 
 
 @pytest.mark.parametrize("tail", [b'{"episode": 3, "start"', b"\x00" * 50, b'{"episode": 3}'])
@@ -329,10 +352,6 @@ def test_the_index_is_one_plain_json_line_per_episode(record):
     assert [(entry["episode"], entry["start"], entry["length"]) for entry in entries] == [(1, 0, 20), (2, 20, 30)]
 
 
-if __name__ == "__main__":
-    pytest.main([__file__])
-
-
 @pytest.mark.parametrize("lost", ["episodes.jsonl", "state.memmap"])
 def test_a_dataset_that_lost_a_file_is_not_cut_to_nothing(tmp_path, make_episode, meta, lost):
     """Without its index a dataset would look empty, and a writer would make it so."""
@@ -343,3 +362,7 @@ def test_a_dataset_that_lost_a_file_is_not_cut_to_nothing(tmp_path, make_episode
     with pytest.raises(ValueError, match=f"has lost {lost}: restore it"):
         EpisodeWriter(tmp_path, target_episodes=2, meta=meta)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])

@@ -6,11 +6,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_ficreg import ConvEncoder, ViTEncoder
+from torchrl_ficreg import ConvEncoder, KeypointEncoder, ViTEncoder
+from torchrl_ficreg.modules.keypoints import SpatialSoftmax
 from torchrl_ficreg.modules.pixels import IMAGENET_MEAN, IMAGENET_STD, PixelNormalizer
 
 BUILD = {
     "conv": lambda **kwargs: ConvEncoder(image_size=16, channels=(4, 8), projector_dim=12, latent_dim=6, **kwargs),
+    "keypoint": lambda **kwargs: KeypointEncoder(
+        image_size=16, channels=(4, 8, 8), num_keypoints=5, latent_dim=6, **kwargs
+    ),
     "vit": lambda **kwargs: ViTEncoder(
         image_size=16, patch_size=8, width=12, depth=2, heads=3, mlp_dim=16, projector_dim=12, latent_dim=6, **kwargs
     ),
@@ -64,10 +68,11 @@ def test_keys_can_be_renamed_nested_too(build, encoder):
     assert renamed(TensorDict({("obs", "rgb"): pixels}, [3]))["belief", "z"].equal(encoder(pixels=pixels))
 
 
-def test_training_moves_the_running_statistics_of_the_projector(build):
+def test_training_moves_the_running_statistics_once(build):
     encoder = build()
     encoder(pixels=frames(2, 4))
-    assert encoder.module.projector.norm.num_batches_tracked == 1
+    (norm,) = [module for module in encoder.modules() if isinstance(module, torch.nn.BatchNorm1d)]
+    assert norm.num_batches_tracked == 1
 
 
 @pytest.mark.parametrize(
@@ -107,3 +112,19 @@ def test_the_vision_transformer_sees_patches_in_reading_order():
     kernel = network.to_patch.weight.unflatten(1, (3, 8, 8))
     expected = torch.nn.functional.conv2d(image, kernel, network.to_patch.bias, stride=8).flatten(2).transpose(1, 2)
     torch.testing.assert_close(network.to_patch(cut), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_spatial_softmax_tells_where_the_mass_of_a_map_is():
+    """The place of a Gaussian bump, to a thousandth of the picture, wherever it lies between the pixels."""
+    place = torch.rand(6, 2) - 0.5  # [N, (x, y)]
+    grid = torch.linspace(-1, 1, 33)
+    squared = (grid[None, None, :] - place[:, 0, None, None]) ** 2 + (grid[None, :, None] - place[:, 1, None, None]) ** 2
+    found = SpatialSoftmax()(-squared[:, None] / (2 * 0.1**2))  # [N, 2]
+    torch.testing.assert_close(found, place, atol=1e-3, rtol=0)
+
+
+def test_a_keypoint_encoder_refuses_frames_and_layers_it_cannot_halve_twice():
+    with pytest.raises(ValueError, match="multiple of 4"):
+        KeypointEncoder(image_size=30)
+    with pytest.raises(ValueError, match="three convolutions"):
+        KeypointEncoder(channels=(8, 8))

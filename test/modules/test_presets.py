@@ -79,7 +79,7 @@ def test_no_dropout_is_a_choice_however_it_is_written():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"encoder": "resnet"}, "unknown encoder 'resnet': choose 'vit' or 'conv'"),
+        ({"encoder": "resnet"}, "unknown encoder 'resnet': choose 'vit', 'conv' or 'keypoint'"),
         ({"latent_dim": 0, "history": -1}, "positive, got latent_dim=0, history=-1"),
         ({"conv_channels": (4, 0)}, r"positive, got conv_channels=\(4, 0\)"),
         ({"conv_channels": ()}, r"positive, got conv_channels=\(\)"),

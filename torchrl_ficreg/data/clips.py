@@ -138,10 +138,10 @@ class ClipStorage(TensorStorage):
                 clip[key] = torch.from_numpy(np.broadcast_to(episode[..., None], frame.shape).copy())
             elif key == STEP:
                 clip[key] = torch.from_numpy(frame - self.store.start[episode - 1][..., None])
+            elif key == PIXELS:
+                clip[key] = torch.from_numpy(self.store.frames(frame))  # [B..., T, 3, H, W]
             else:
-                # numpy gathers uint8 rows about five times faster than torch's advanced indexing, and does not
-                # share torch's thread pool with the training step.
-                clip[key] = torch.from_numpy(self.store.arrays[key][frame])  # [B..., T, ...]
+                clip[key] = torch.from_numpy(np.take(self.store.arrays[key], frame, axis=0))  # [B..., T, S]
         # A device is needed for pinning: TorchRL leaves tensordicts without one alone.
         return TensorDict(clip, batch_size=frame.shape, device="cpu")
 
@@ -171,7 +171,9 @@ class ClipStorage(TensorStorage):
         last = stop[..., None] - 1  # [..., 1], the row without an action
         mask = torch.from_numpy(frame + self.frame_skip <= last)  # [..., T]
         rows = np.minimum(frame[..., None] + np.arange(self.frame_skip), last[..., None])  # [..., T, F]
-        block = torch.from_numpy(self.store.arrays[ACTION][rows]).flatten(-2)  # [..., T, F, A] -> [..., T, F * A]
+        # np.take: several times as fast as arrays[rows] where a row is a few numbers.
+        block = torch.from_numpy(np.take(self.store.arrays[ACTION], rows, axis=0))  # [..., T, F, A]
+        block = block.flatten(-2)  # [..., T, F * A]
         if self.statistics is not None:
             block = self.statistics.normalize(block)
         # Selected rather than multiplied, and after z-scoring: a masked block is zero, not minus mean over std.

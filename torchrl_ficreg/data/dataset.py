@@ -19,7 +19,7 @@ from torchrl_ficreg.data.clips import ClipStorage
 from torchrl_ficreg.data.layout import META_FILE
 from torchrl_ficreg.data.replay import SeekableReplayBuffer
 from torchrl_ficreg.data.sampler import ClipSampler
-from torchrl_ficreg.data.schema import ACTION, DONE, EPISODE, PIXELS, STEP
+from torchrl_ficreg.data.schema import ACTION, DONE, EPISODE, PIXELS, STATE, STEP
 from torchrl_ficreg.data.splits import Split, split_episodes
 from torchrl_ficreg.data.statistics import ActionStatistics
 from torchrl_ficreg.data.store import EpisodeStore, Verify
@@ -221,21 +221,29 @@ class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
             raise IndexError(f"episode {episode} has steps 0 to {rows.stop - rows.start - 1}, got {step}.")
         return rows.start + step
 
-    def episode_data(self, episode: int) -> TensorDict:
-        """One whole episode of this split, in environment units and without a copy.
+    def episode_data(
+        self, episode: int, *, steps: slice = slice(None), keys: Sequence[str] = (PIXELS, ACTION, STATE)
+    ) -> TensorDict:
+        """One episode of this split, in environment units, and without a copy where the frames are raw.
+
+        Args:
+            episode: its id.
+            steps: the steps wanted, forwards. Default: all L.
+            keys: the columns wanted: compressed frames are decoded only on demand.
 
         Returns:
-            [L]: ``pixels``, ``action``, ``state``, ``episode``, ``step`` and ``("next", "done")``.
+            [L]: ``keys``, ``episode``, ``step`` and ``("next", "done")``.
 
         Raises:
             KeyError: the split has no such episode.
         """
         rows = self._rows(episode)
-        length = rows.stop - rows.start
-        data = TensorDict({key: torch.from_numpy(array[rows]) for key, array in self._store.arrays.items()}, [length])
-        data[EPISODE] = torch.full((length,), episode)
-        data[STEP] = torch.arange(length)
-        data[DONE] = (data[STEP] == length - 1).unsqueeze(-1)  # [L, 1]
+        step = torch.arange(rows.stop - rows.start)[steps]
+        rows = slice(*(rows.start + bound for bound in steps.indices(rows.stop - rows.start)[:2]), steps.step)
+        read = {key: self._store.frames if key == PIXELS else self._store.arrays[key].__getitem__ for key in keys}
+        data = TensorDict({key: torch.from_numpy(get(rows)) for key, get in read.items()}, [len(step)])
+        data[EPISODE], data[STEP] = torch.full_like(step, episode), step
+        data[DONE] = (step == self._store.length[episode - 1] - 1).unsqueeze(-1)  # [L, 1]
         return data
 
     @_classproperty

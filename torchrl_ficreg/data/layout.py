@@ -9,6 +9,11 @@
       action.memmap
       state.memmap
 
+With compressed frames two files stand in for ``pixels.memmap``::
+
+      pixels.blob        one lossless image per row, one after another
+      pixels.offsets     int64 per row: one past the last byte of its image
+
 The index alone says what exists. Bytes of a data file beyond the rows of the last index line belong to an
 episode that was never committed, and a last line without its newline was never committed either: readers
 ignore both, a writer cuts them off. Everything else that does not fit is damage and raises.
@@ -26,13 +31,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchrl_ficreg.data.frames import frame_bytes, FRAME_FORMATS, FrameFormat
 from torchrl_ficreg.data.schema import ACTION, PIXELS, STATE
 
 FORMAT = "torchrl_ficreg.episodes"
-VERSION = 1
+# Version 2 has compressed frames. Raw datasets stay at version 1: code that knows nothing else reads them as before.
+VERSIONS = (1, 2)
 META_FILE = "meta.json"
 INDEX_FILE = "episodes.jsonl"
 DTYPES = {PIXELS: np.dtype("<u1"), ACTION: np.dtype("<f4"), STATE: np.dtype("<f8")}
+
+BLOB, OFFSETS = "pixels.blob", "pixels.offsets"
+OFFSET_DTYPE = np.dtype("<i8")
 
 COLLECT_HINT = "collect it with `python sota-implementations/ficreg/collect.py env={env}`"
 
@@ -45,11 +55,24 @@ class Header:
         target_episodes: number of episodes that makes the dataset complete.
         shapes: key -> shape of one row, for example ``{"pixels": (3, 224, 224), "action": (2,), "state": (4,)}``.
         meta: the user's own fields, as they come back from JSON.
+        frames: how the frames are stored.
     """
 
     target_episodes: int
     shapes: dict[str, tuple[int, ...]]
     meta: dict[str, Any]
+    frames: FrameFormat = "raw"
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the data files."""
+        pixels = (f"{PIXELS}.memmap",) if self.frames == "raw" else (BLOB, OFFSETS)
+        return (*pixels, *(f"{key}.memmap" for key in self.mapped if key != PIXELS))
+
+    @property
+    def mapped(self) -> tuple[str, ...]:
+        """Keys whose rows lie in a file as they are."""
+        return tuple(key for key in DTYPES if key != PIXELS or self.frames == "raw")
 
     def row_bytes(self, key: str) -> int:
         """Bytes of one row of ``key``."""
@@ -63,7 +86,8 @@ class Header:
         """The text of ``meta.json``."""
         content = {
             "format": FORMAT,
-            "version": VERSION,
+            "version": 1 if self.frames == "raw" else 2,
+            "frames": self.frames,
             "target_episodes": self.target_episodes,
             "shapes": {key: list(shape) for key, shape in self.shapes.items()},
             "dtypes": {key: dtype.str for key, dtype in DTYPES.items()},
@@ -85,11 +109,14 @@ class Header:
             version = content["version"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{where} is not the header of a {FORMAT} dataset: collect or copy it again.") from error
-        if version != VERSION:
-            raise ValueError(f"{where} has format version {version!r}, this code reads {VERSION}: collect it again.")
+        if version not in VERSIONS:
+            raise ValueError(f"{where} has format version {version!r}, this code reads 1 and 2: collect it again.")
         try:
             shapes = {key: tuple(content["shapes"][key]) for key in DTYPES}
-            return cls(int(content["target_episodes"]), shapes, dict(content["meta"]))
+            frames = content.get("frames", "raw")  # absent from the first datasets
+            if frames not in FRAME_FORMATS:
+                raise ValueError(f"'frames', {frames!r}")
+            return cls(int(content["target_episodes"]), shapes, dict(content["meta"]), frames)
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{where} lacks or garbles the field {error}: collect or copy it again.") from error
 
@@ -102,7 +129,7 @@ class IndexEntry(NamedTuple):
         start: its first row in every data file.
         length: its number of rows.
         crc: crc32 of its action bytes followed by its state bytes.
-        pixels_crc: crc32 of its pixel bytes.
+        pixels_crc: crc32 of its pixel bytes, before any compression.
     """
 
     episode: int
@@ -170,7 +197,7 @@ def checksums(episode: dict[str, np.ndarray]) -> tuple[int, int]:
 
 
 def data_file(path: Path, key: str) -> Path:
-    """The file that holds the rows of ``key``."""
+    """The file that holds the rows of ``key`` as they are."""
     return path / f"{key}.memmap"
 
 
@@ -180,12 +207,62 @@ def check_sizes(path: Path, header: Header, num_steps: int) -> None:
     Raises:
         ValueError: a data file is missing or too short.
     """
-    for key in DTYPES:
-        file = data_file(path, key)
-        need = num_steps * header.row_bytes(key)
-        size = file.stat().st_size if file.exists() else 0
-        if size < need or not file.exists():
-            raise ValueError(f"{file} is damaged: {size} bytes, the index needs {need}: restore it or collect again.")
+    for key in header.mapped:
+        _check_size(data_file(path, key), num_steps * header.row_bytes(key))
+    if header.frames != "raw":
+        ends = read_offsets(path, num_steps)
+        _check_size(path / BLOB, int(ends[-1]) if num_steps else 0)
+
+
+def read_offsets(path: Path, num_steps: int) -> np.ndarray:
+    """Where the image of each row ends, int64 [num_steps], in bytes of ``pixels.blob``.
+
+    Raises:
+        ValueError: the file is missing, too short, or its numbers do not increase.
+    """
+    _check_size(path / OFFSETS, num_steps * OFFSET_DTYPE.itemsize)
+    ends = np.fromfile(path / OFFSETS, OFFSET_DTYPE, count=num_steps)
+    if (np.diff(ends, prepend=0) <= 0).any():
+        row = int(np.argmax(np.diff(ends, prepend=0) <= 0))
+        raise ValueError(
+            f"{path / OFFSETS} is damaged: the image of row {row} ends where it begins or before: restore it or "
+            "collect again."
+        )
+    return ends
+
+
+def _check_size(file: Path, need: int) -> None:
+    size = file.stat().st_size if file.exists() else 0
+    if size < need or not file.exists():
+        raise ValueError(f"{file} is damaged: {size} bytes, the index needs {need}: restore it or collect again.")
+
+
+def estimate_bytes(
+    num_steps: int,
+    image_size: int | tuple[int, int],
+    action_dim: int,
+    state_dim: int,
+    frames: FrameFormat = "raw",
+) -> int:
+    """Disk space that ``num_steps`` rows take, in bytes: exact for raw frames, on the safe side for the others.
+
+    Args:
+        num_steps: rows over all episodes.
+        image_size: pixels of a side, or (height, width).
+        action_dim: A.
+        state_dim: S.
+        frames: how the frames are stored. Compressed ones are taken for drawings and simple renderings, as the
+            environments of this package make them; photographs need more.
+
+    Examples:
+        >>> estimate_bytes(10_000, 64, action_dim=2, state_dim=4)  # 123 MB
+        123280000
+        >>> estimate_bytes(10_000, 64, action_dim=2, state_dim=4, frames="webp")
+        38880000
+    """
+    height, width = (image_size, image_size) if isinstance(image_size, int) else image_size
+    row = DTYPES[ACTION].itemsize * action_dim + DTYPES[STATE].itemsize * state_dim
+    return num_steps * (row + frame_bytes(height, width, frames))
 
 
 def write_header(path: Path, header: Header) -> None:

@@ -12,7 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from torchrl_ficreg.data.frames import ImageFrames, RawFrames
 from torchrl_ficreg.data.layout import (
+    BLOB,
     check_sizes,
     checksums,
     COLLECT_HINT,
@@ -23,8 +25,9 @@ from torchrl_ficreg.data.layout import (
     IndexEntry,
     META_FILE,
     parse_index,
+    read_offsets,
 )
-from torchrl_ficreg.data.schema import check_episode
+from torchrl_ficreg.data.schema import check_episode, PIXELS
 
 Verify = Literal["ends", "full", "none"]
 
@@ -44,28 +47,44 @@ class EpisodeStore:
 
     The arrays of a directory are private mappings: pages are read when touched, and a write stays in this
     process. Pickling a store of a directory carries its path, not its data, and maps again on arrival.
+    Frames are read with :meth:`frames`, however they are stored.
 
     Args:
         header: target, row shapes and the user's fields.
         entries: the committed episodes.
-        arrays: key -> [N, ...] rows.
-        path: the directory the arrays were mapped from, or ``None`` for data in memory.
+        arrays: key -> [N, ...] rows. ``None`` maps those of ``path``.
+        path: the directory the arrays are mapped from, or ``None`` for data in memory.
+
+    Keyword Args:
+        num_threads: threads that copy or decode frames. Default: the usable cores, at most eight. What is read does
+            not depend on it.
 
     Attributes:
         start: int64 [E], first row of each episode; episode ``e`` is entry ``e - 1``.
         length: int64 [E], rows of each episode.
-        fingerprint: sha256 of the index, and through its checksums of the data.
+        arrays: key -> [N, ...] rows; ``pixels`` is among them only when the frames are raw.
+        fingerprint: sha256 of the index, and through its checksums of the data; the same for every frame format.
     """
 
     def __init__(
-        self, header: Header, entries: list[IndexEntry], arrays: dict[str, np.ndarray], path: Path | None = None
+        self,
+        header: Header,
+        entries: list[IndexEntry],
+        arrays: dict[str, np.ndarray] | None,
+        path: Path | None = None,
+        *,
+        num_threads: int | None = None,
     ) -> None:
+        if num_threads is not None and num_threads < 1:
+            raise ValueError(f"num_threads must be at least 1, got {num_threads}.")
         self.header = header
         self.path = path
+        self.num_threads = num_threads
         self.arrays = arrays
         self.start = np.array([entry.start for entry in entries], dtype=np.int64)
         self.length = np.array([entry.length for entry in entries], dtype=np.int64)
         self.fingerprint = hashlib.sha256(b"".join(entry.to_line() for entry in entries)).hexdigest()
+        self._open_data()
 
     @property
     def num_steps(self) -> int:
@@ -82,17 +101,37 @@ class EpisodeStore:
         start = int(self.start[episode - 1])
         return slice(start, start + int(self.length[episode - 1]))
 
+    def frames(self, rows: slice | np.ndarray) -> np.ndarray:
+        """Reads frames.
+
+        Args:
+            rows: row numbers of any shape, or a slice of rows.
+
+        Returns:
+            uint8 [*rows.shape, 3, H, W], the caller's to keep and to write to. A slice of raw frames is not copied:
+            what is written into it is seen by later readers of this process, never by the file.
+
+        Raises:
+            IndexError: a row beyond the last, or a negative one.
+            ValueError: an image is damaged.
+        """
+        return self._frames.read(rows)
+
     @classmethod
-    def open(cls, path: Path, *, allow_incomplete: bool = False, verify: Verify = "ends") -> EpisodeStore:
+    def open(
+        cls, path: Path, *, allow_incomplete: bool = False, verify: Verify = "ends", num_threads: int | None = None
+    ) -> EpisodeStore:
         """Opens a dataset directory.
 
         Args:
             path: the directory.
             allow_incomplete: accept fewer episodes than the target.
             verify: whose checksums to compare: the first and last episode's, every episode's, or nobody's.
+            num_threads: threads that copy or decode frames. Default: the usable cores, at most eight.
 
         Raises:
             FileNotFoundError: there is no dataset at ``path``.
+            ImportError: the frames are compressed and Pillow is missing.
             ValueError: the dataset is damaged, incomplete, empty or of another format version.
         """
         if verify not in ("ends", "full", "none"):
@@ -108,8 +147,7 @@ class EpisodeStore:
             escape = ", or pass allow_incomplete=True" if entries else ""
             got = f"{len(entries)} of {header.target_episodes} episodes"
             raise ValueError(f"{path} holds {got}: {hint}, which continues{escape}.")
-        check_sizes(path, header, entries[-1].stop)
-        store = cls(header, entries, _map_rows(path, header, entries[-1].stop), path)
+        store = cls(header, entries, None, path, num_threads=num_threads)
         checked = {"ends": {entries[0], entries[-1]}, "full": entries, "none": ()}[verify]
         for entry in checked:
             store._check(entry)
@@ -140,38 +178,49 @@ class EpisodeStore:
 
     def __getstate__(self) -> dict[str, Any]:
         state = self.__dict__.copy()
+        del state["_frames"]
         if self.path is not None:
             state["arrays"] = None
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        if self.path is not None:
-            check_sizes(self.path, self.header, self.num_steps)
-            self.arrays = _map_rows(self.path, self.header, self.num_steps)
+        self._open_data()
+
+    def _open_data(self) -> None:
+        options = {"num_threads": self.num_threads}
+        header, num_steps = self.header, self.num_steps
+        if self.path is not None and self.arrays is None:
+            check_sizes(self.path, header, num_steps)
+            self.arrays = {key: _map_rows(self.path, header, num_steps, key) for key in header.mapped}
+        if header.frames == "raw":
+            self._frames: RawFrames | ImageFrames = RawFrames(self.arrays[PIXELS], **options)
+        else:
+            ends = read_offsets(self.path, num_steps)
+            blob = _map_file(self.path / BLOB, int(ends[-1]))
+            self._frames = ImageFrames(blob, ends, header.shapes[PIXELS], header.frames, **options)
 
     def _check(self, entry: IndexEntry) -> None:
         rows = slice(entry.start, entry.stop)
-        if checksums({key: array[rows] for key, array in self.arrays.items()}) != (entry.crc, entry.pixels_crc):
+        episode = {**{key: array[rows] for key, array in self.arrays.items()}, PIXELS: self.frames(rows)}
+        if checksums(episode) != (entry.crc, entry.pixels_crc):
             raise ValueError(
                 f"{self.path} is damaged: the bytes of episode {entry.episode} do not match their checksum: "
                 "restore the files or collect again."
             )
 
 
-def _map_rows(path: Path, header: Header, num_steps: int) -> dict[str, np.ndarray]:
-    """Maps the first ``num_steps`` rows of every key, copy-on-write."""
-    arrays = {}
-    for key, dtype in DTYPES.items():
-        descriptor = os.open(data_file(path, key), os.O_RDONLY)
-        try:
-            mapped = mmap.mmap(
-                descriptor,
-                num_steps * header.row_bytes(key),
-                flags=mmap.MAP_PRIVATE | _MAP_NORESERVE,
-                prot=mmap.PROT_READ | mmap.PROT_WRITE,
-            )
-        finally:
-            os.close(descriptor)
-        arrays[key] = np.frombuffer(mapped, dtype).reshape(num_steps, *header.shapes[key])
-    return arrays
+def _map_rows(path: Path, header: Header, num_steps: int, key: str) -> np.ndarray:
+    """Maps the first ``num_steps`` rows of a key."""
+    mapped = _map_file(data_file(path, key), num_steps * header.row_bytes(key))
+    return np.frombuffer(mapped, DTYPES[key]).reshape(num_steps, *header.shapes[key])
+
+
+def _map_file(file: Path, size: int) -> mmap.mmap:
+    """Maps the first ``size`` bytes of a file, copy-on-write."""
+    descriptor = os.open(file, os.O_RDONLY)
+    try:
+        flags, protection = mmap.MAP_PRIVATE | _MAP_NORESERVE, mmap.PROT_READ | mmap.PROT_WRITE
+        return mmap.mmap(descriptor, size, flags=flags, prot=protection)
+    finally:
+        os.close(descriptor)

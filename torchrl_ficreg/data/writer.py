@@ -6,27 +6,30 @@ import fcntl
 import json
 import os
 from collections.abc import Mapping
-from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from torchrl_ficreg.data.frames import check_frame_format, encode_frames, FrameFormat
 from torchrl_ficreg.data.layout import (
+    BLOB,
     check_sizes,
     checksums,
-    data_file,
     DTYPES,
     Header,
     INDEX_FILE,
     IndexEntry,
     META_FILE,
+    OFFSET_DTYPE,
+    OFFSETS,
     parse_index,
+    read_offsets,
     sync_directory,
     write_all,
     write_header,
 )
-from torchrl_ficreg.data.schema import ACTION, check_episode, PIXELS, STATE
+from torchrl_ficreg.data.schema import check_episode, PIXELS
 
 
 class EpisodeWriter:
@@ -49,12 +52,16 @@ class EpisodeWriter:
             anything JSON can hold, numpy values included.
         resume: continue an existing dataset. With ``False`` an existing dataset is an error.
         wait: let another writer of the same dataset finish first. With ``False`` it is an error.
+        frames: ``"raw"`` stores frames as they are, which is fastest to read. ``"webp"`` and ``"png"`` store one
+            lossless image per frame: what is read back is the same to the bit, and so is the fingerprint.
+        num_threads: frames compressed at a time. Default: the usable cores, at most eight.
 
     Raises:
         FileExistsError: the dataset exists and ``resume`` is false.
+        ImportError: ``frames`` needs Pillow.
         RuntimeError: another writer has the dataset open.
         TypeError: ``meta`` holds something JSON cannot.
-        ValueError: the dataset was begun with another ``meta`` or a larger target, or is damaged.
+        ValueError: the dataset was begun with another ``meta``, other ``frames`` or a larger target, or is damaged.
 
     Examples:
         >>> import tempfile, numpy as np
@@ -76,23 +83,34 @@ class EpisodeWriter:
     """
 
     def __init__(
-        self, path: str | Path, *, target_episodes: int, meta: Mapping[str, Any], resume: bool = True, wait: bool = False
+        self,
+        path: str | Path,
+        *,
+        target_episodes: int,
+        meta: Mapping[str, Any],
+        resume: bool = True,
+        wait: bool = False,
+        frames: FrameFormat = "raw",
+        num_threads: int | None = None,
     ) -> None:
+        check_frame_format(frames)
         if target_episodes < 1:
             raise ValueError(f"target_episodes must be at least 1, got {target_episodes}.")
         self.path = Path(path).expanduser()
         self.target_episodes = int(target_episodes)
         self.meta: dict[str, Any] = json.loads(json.dumps(dict(meta), default=_to_builtin))
+        self.frames: FrameFormat = frames
+        self.num_threads = num_threads
         self.num_episodes = 0
         self.num_steps = 0
         self._header: Header | None = None
         self._index_bytes = 0
+        self._blob_bytes = 0
         self._files: dict[str, int] = {}
         if not resume and (self.path / META_FILE).exists():
             raise FileExistsError(f"{self.path} already holds a dataset: pass resume=True, or another directory.")
         if (self.path / META_FILE).exists():  # looked for before anything is created, let alone cut
-            lost = [name for name in (INDEX_FILE, *(data_file(self.path, key).name for key in DTYPES))]
-            lost = [name for name in lost if not (self.path / name).exists()]
+            lost = [name for name in (INDEX_FILE, *self._read_header().files) if not (self.path / name).exists()]
             if lost:
                 raise ValueError(f"{self.path} has lost {', '.join(lost)}: restore it, or use another directory.")
         self.path.mkdir(parents=True, exist_ok=True)
@@ -137,10 +155,10 @@ class EpisodeWriter:
         elif shapes != self._header.shapes:
             raise ValueError(f"row shapes must stay {self._header.shapes}, got {shapes}: use another directory.")
         entry = IndexEntry(self.num_episodes + 1, self.num_steps, length, *checksums(episode))
-        line = entry.to_line()
+        line, (content, blob_bytes) = entry.to_line(), self._to_files(episode)
         try:
-            for key, dtype in DTYPES.items():
-                write_all(self._files[key], np.ascontiguousarray(episode[key], dtype))
+            for name, rows in content.items():
+                write_all(self._files[name], rows)
             for descriptor in self._files.values():
                 os.fsync(descriptor)
             write_all(self._index, line)
@@ -152,6 +170,7 @@ class EpisodeWriter:
             raise
         self.num_episodes, self.num_steps = entry.episode, entry.stop
         self._index_bytes += len(line)
+        self._blob_bytes = blob_bytes
         return entry.episode
 
     def finish(self) -> None:
@@ -185,23 +204,41 @@ class EpisodeWriter:
         except BlockingIOError as error:
             raise RuntimeError(f"another writer has {self.path} open: wait for it or use another path.") from error
 
+    def _to_files(self, episode: dict[str, np.ndarray]) -> tuple[dict[str, Any], int]:
+        """What to append to each data file, and how long the file of images is then."""
+        content: dict[str, Any] = {
+            f"{key}.memmap": np.ascontiguousarray(episode[key], dtype)
+            for key, dtype in DTYPES.items()
+            if key in self._header.mapped
+        }
+        if self.frames == "raw":
+            return content, 0
+        images = encode_frames(episode[PIXELS], self.frames, num_threads=self.num_threads)
+        ends = self._blob_bytes + np.cumsum([len(image) for image in images])
+        return {BLOB: b"".join(images), OFFSETS: ends.astype(OFFSET_DTYPE), **content}, int(ends[-1])
+
     def _begin(self, shapes: dict[str, tuple[int, ...]]) -> None:
         # meta.json comes last: a directory that has one has all its files.
-        self._open_data()
+        header = Header(self.target_episodes, shapes, self.meta, self.frames)
+        self._open_data(header)
         self._truncate()
-        header = Header(self.target_episodes, shapes, self.meta)
         write_header(self.path, header)
         self._header = header
 
+    def _read_header(self) -> Header:
+        return Header.from_json((self.path / META_FILE).read_text(), self.path / META_FILE)
+
     def _resume(self) -> None:
-        header = Header.from_json((self.path / META_FILE).read_text(), self.path / META_FILE)
+        header = self._read_header()
         self._check_meta(header)
         index_file = self.path / INDEX_FILE
         entries, self._index_bytes = parse_index(index_file.read_bytes(), index_file)
         if entries:
             self.num_episodes, self.num_steps = entries[-1].episode, entries[-1].stop
         check_sizes(self.path, header, self.num_steps)
-        self._open_data()
+        if header.frames != "raw" and self.num_steps:
+            self._blob_bytes = int(read_offsets(self.path, self.num_steps)[-1])
+        self._open_data(header)
         self._header = header
         self._truncate()
         if self.target_episodes != header.target_episodes:
@@ -209,8 +246,12 @@ class EpisodeWriter:
             write_header(self.path, self._header)
 
     def _check_meta(self, header: Header) -> None:
+        settings = [("frames", header.frames, self.frames)]
         for name in sorted(set(header.meta) | set(self.meta)):
-            old, new = (json.dumps(meta[name]) if name in meta else "nothing" for meta in (header.meta, self.meta))
+            both = (header.meta, self.meta)
+            old, new = (json.dumps(meta[name], sort_keys=True) if name in meta else "nothing" for meta in both)
+            settings.append((name, old, new))
+        for name, old, new in settings:
             if old != new:
                 raise ValueError(
                     f"{self.path} was begun with {name} = {old}, got {new}: repeat the first settings, or use another "
@@ -222,35 +263,19 @@ class EpisodeWriter:
                 "a target may only grow."
             )
 
-    def _open_data(self) -> None:
-        for key in DTYPES.keys() - self._files.keys():
-            flags = os.O_RDWR | os.O_CREAT | os.O_APPEND
-            self._files[key] = os.open(data_file(self.path, key), flags, 0o644)
+    def _open_data(self, header: Header) -> None:
+        for name in set(header.files) - self._files.keys():
+            self._files[name] = os.open(self.path / name, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         sync_directory(self.path)
 
     def _truncate(self) -> None:
         """Cuts the index, then the data, back to the last committed episode."""
         os.ftruncate(self._index, self._index_bytes)
-        for key, descriptor in self._files.items():
-            os.ftruncate(descriptor, self.num_steps * self._header.row_bytes(key) if self._header else 0)
-
-
-def estimate_bytes(num_steps: int, image_size: int | tuple[int, int], action_dim: int, state_dim: int) -> int:
-    """Disk space that ``num_steps`` rows take, in bytes.
-
-    Args:
-        num_steps: rows over all episodes.
-        image_size: pixels of a side, or (height, width).
-        action_dim: A.
-        state_dim: S.
-
-    Examples:
-        >>> estimate_bytes(10_000, 64, action_dim=2, state_dim=4)  # 123 MB
-        123280000
-    """
-    height, width = (image_size, image_size) if isinstance(image_size, int) else image_size
-    row = {PIXELS: (3, height, width), ACTION: (action_dim,), STATE: (state_dim,)}
-    return num_steps * sum(DTYPES[key].itemsize * prod(shape) for key, shape in row.items())
+        sizes = {BLOB: self._blob_bytes, OFFSETS: self.num_steps * OFFSET_DTYPE.itemsize}
+        if self._header:
+            sizes |= {f"{key}.memmap": self.num_steps * self._header.row_bytes(key) for key in self._header.mapped}
+        for name, descriptor in self._files.items():
+            os.ftruncate(descriptor, sizes.get(name, 0))
 
 
 def _to_builtin(value: Any) -> Any:

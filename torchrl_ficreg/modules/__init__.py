@@ -2,6 +2,7 @@
 
 from torchrl_ficreg.modules.conv import ConvEncoder
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
+from torchrl_ficreg.modules.keypoints import KeypointEncoder
 from torchrl_ficreg.modules.planners import GoalDistance, LatentCEMPlanner, LatentPlanner, MPCPolicy, PlanConfig
 from torchrl_ficreg.modules.predictor import ActionEncoder, CausalPredictor
 from torchrl_ficreg.modules.presets import make_world_model, ModelConfig
@@ -14,6 +15,7 @@ __all__ = [
     "ConvEncoder",
     "GoalDistance",
     "InverseDynamicsModel",
+    "KeypointEncoder",
     "LatentCEMPlanner",
     "LatentPlanner",
     "LatentWorldModel",

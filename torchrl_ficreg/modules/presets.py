@@ -7,6 +7,7 @@ from typing import Literal
 
 from torchrl_ficreg.modules.conv import ConvEncoder
 from torchrl_ficreg.modules.inverse import INVERSE_NETWORKS, InverseDynamicsModel
+from torchrl_ficreg.modules.keypoints import KeypointEncoder
 from torchrl_ficreg.modules.predictor import CausalPredictor
 from torchrl_ficreg.modules.vit import ViTEncoder
 from torchrl_ficreg.modules.world_model import LatentWorldModel
@@ -20,13 +21,15 @@ class ModelConfig:
         ValueError: an unknown encoder or a size that is not positive.
     """
 
-    encoder: Literal["vit", "conv"] = "vit"
+    encoder: Literal["vit", "conv", "keypoint"] = "vit"
     image_size: int = 224  # H = W of the frames, pixels
     frame_skip: int = 5  # F, environment steps between two frames of a clip
     latent_dim: int = 192  # D
     history: int = 3  # H, latents the predictor sees
     conv_channels: tuple[int, ...] = (16, 32, 64, 128)  # of the "conv" encoder; each layer halves the frame
-    encoder_projector_dim: int = 2048  # hidden width of the encoder's BatchNorm projector
+    encoder_projector_dim: int = 2048  # hidden width of the BatchNorm projector of the "vit" and "conv" encoders
+    keypoint_channels: tuple[int, ...] = (32, 64, 64)  # of the "keypoint" encoder's three convolutions
+    num_keypoints: int = 32  # maps of the "keypoint" encoder
     predictor_width: int = 192
     predictor_depth: int = 6
     predictor_heads: int = 16
@@ -38,9 +41,10 @@ class ModelConfig:
     inverse_hidden_dim: int = 512  # hidden width of the inverse dynamics model
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "conv_channels", tuple(self.conv_channels))  # JSON and YAML know lists only
-        if self.encoder not in ("vit", "conv"):
-            raise ValueError(f"unknown encoder {self.encoder!r}: choose 'vit' or 'conv'.")
+        for name in ("conv_channels", "keypoint_channels"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))  # JSON and YAML know lists only
+        if self.encoder not in ("vit", "conv", "keypoint"):
+            raise ValueError(f"unknown encoder {self.encoder!r}: choose 'vit', 'conv' or 'keypoint'.")
         if self.inverse_kind not in INVERSE_NETWORKS:
             raise ValueError(f"unknown inverse_kind {self.inverse_kind!r}: choose one of {sorted(INVERSE_NETWORKS)}.")
         sizes = {name: value for name, value in asdict(self).items() if not isinstance(value, (str, float)) and name != "predictor_dropout"}
@@ -95,15 +99,15 @@ def make_world_model(config: ModelConfig, action_dim: int) -> tuple[LatentWorldM
         18034478
     """
     block = config.frame_skip * action_dim
-    sizes = {
-        "image_size": config.image_size,
-        "latent_dim": config.latent_dim,
-        "projector_dim": config.encoder_projector_dim,
-    }
+    sizes = {"image_size": config.image_size, "latent_dim": config.latent_dim}
     if config.encoder == "vit":
-        encoder = ViTEncoder(**sizes)
+        encoder = ViTEncoder(projector_dim=config.encoder_projector_dim, **sizes)
+    elif config.encoder == "conv":
+        encoder = ConvEncoder(channels=config.conv_channels, projector_dim=config.encoder_projector_dim, **sizes)
     else:
-        encoder = ConvEncoder(channels=config.conv_channels, **sizes)
+        encoder = KeypointEncoder(
+            channels=config.keypoint_channels, num_keypoints=config.num_keypoints, **sizes
+        )
     predictor = CausalPredictor(
         latent_dim=config.latent_dim,
         action_dim=block,

@@ -18,6 +18,7 @@ from torchrl_ficreg.modules.inverse import (
     InverseEnsemble,
     InverseTransformer,
 )
+from torchrl_ficreg.modules.keypoints import KeypointEncoder, KeypointNetwork
 from torchrl_ficreg.modules.predictor import CausalPredictor, CausalTransformer
 from torchrl_ficreg.modules.vit import VisionTransformer, ViTEncoder
 from torchrl_ficreg.modules.world_model import LatentWorldModel
@@ -47,7 +48,7 @@ def world_model_sizes(model: LatentWorldModel) -> Sizes:
 def build_world_model(sizes: Sizes) -> LatentWorldModel:
     """The world model that :func:`world_model_sizes` describes, with fresh weights."""
     arguments = dict(sizes["encoder"])
-    encoder = {"vit": ViTEncoder, "conv": ConvEncoder}[arguments.pop("kind")](**arguments)
+    encoder = {"vit": ViTEncoder, "conv": ConvEncoder, "keypoint": KeypointEncoder}[arguments.pop("kind")](**arguments)
     return LatentWorldModel(encoder, CausalPredictor(**sizes["predictor"]), frame_skip=sizes["frame_skip"])
 
 
@@ -92,8 +93,18 @@ def _foreign(network: nn.Module, known) -> TypeError:
 
 
 def _encoder_sizes(network: nn.Module) -> Sizes:
-    if type(network) not in (VisionTransformer, ConvNetwork):
-        raise _foreign(network, (VisionTransformer, ConvNetwork))
+    known = (VisionTransformer, ConvNetwork, KeypointNetwork)
+    if type(network) not in known:
+        raise _foreign(network, known)
+    if isinstance(network, KeypointNetwork):
+        *channels, maps = [layer.out_channels for layer in network.convolutions if isinstance(layer, nn.Conv2d)]
+        return {
+            "kind": "keypoint",
+            "image_size": network.normalize.image_size,
+            "channels": channels,
+            "num_keypoints": maps,
+            "latent_dim": network.layer_out.out_features,
+        }
     projector = network.projector
     shared = {
         "image_size": network.normalize.image_size,

@@ -1,0 +1,23 @@
+"""Everybody's data: episodes of other projects, turned into datasets of this one."""
+
+from __future__ import annotations
+
+from torchrl_ficreg.data.convert.alignment import Alignment, measure_alignment
+from torchrl_ficreg.data.convert.arrays import from_arrays
+from torchrl_ficreg.data.convert.formats import detect_format, FORMATS, open_source
+from torchrl_ficreg.data.convert.source import EpisodeSource
+from torchrl_ficreg.data.convert.stream import convert, verify_alignment
+from torchrl_ficreg.data.convert.tasks import TASKS
+
+__all__ = [
+    "Alignment",
+    "EpisodeSource",
+    "FORMATS",
+    "TASKS",
+    "convert",
+    "detect_format",
+    "from_arrays",
+    "measure_alignment",
+    "open_source",
+    "verify_alignment",
+]

@@ -1,0 +1,66 @@
+"""Columns of Arrow tables, as Lance and Parquet files hold them, turned into arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from torchrl_ficreg.data.convert.images import decode
+from torchrl_ficreg.data.convert.table import Column, require
+
+
+def describe(kind: Any, cell: Any, rows: int) -> Column:
+    """Says what an Arrow column holds.
+
+    Args:
+        kind: its ``pyarrow.DataType``.
+        cell: its first value, a Python object.
+        rows: how many there are.
+    """
+    picture = picture_bytes(cell)
+    if picture is not None:
+        try:
+            return Column(decode([picture]).shape[1:], "image", rows)
+        except ValueError:
+            return Column((), "text", rows)
+    types = require("pyarrow", "pylance").types
+    shape: list[int] = []
+    while isinstance(cell, list):
+        shape.append(len(cell))
+        kind, cell = kind.value_type, cell[0] if cell else None
+    number = types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)
+    return Column(tuple(shape), "number" if number else "text", rows)
+
+
+def picture_bytes(cell: Any) -> bytes | None:
+    """The encoded picture in a cell: bytes, or a dictionary that holds them, as ``datasets`` writes it."""
+    if isinstance(cell, dict):
+        cell = cell.get("bytes")
+    return cell if isinstance(cell, bytes) else None
+
+
+def to_array(values: Any, column: Column) -> np.ndarray:
+    """Turns a ``ChunkedArray`` into an array.
+
+    Args:
+        values: L values of a column.
+        column: what :func:`describe` said of it.
+
+    Returns:
+        [L, *shape].
+
+    Raises:
+        ValueError: a value is missing, or lists differ in length.
+    """
+    if values.null_count:
+        raise ValueError(f"{values.null_count} values are missing")
+    if column.kind == "image":
+        cells = [picture_bytes(cell) for cell in values.to_pylist()]
+        if None in cells:
+            raise ValueError("a frame holds no bytes: it refers to a file outside the table")
+        return decode(cells)
+    flat = values.combine_chunks()
+    for _ in column.shape:
+        flat = flat.flatten()
+    return flat.to_numpy(zero_copy_only=False).reshape(len(values), *column.shape)

@@ -1,0 +1,127 @@
+"""Which format is it? One door for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from torchrl_ficreg.data.convert.hdf5 import HDF5Table
+from torchrl_ficreg.data.convert.lance import LanceTable
+from torchrl_ficreg.data.convert.lerobot import INFO, LeRobotTable
+from torchrl_ficreg.data.convert.npz import NpzTable
+from torchrl_ficreg.data.convert.source import EpisodeSource
+from torchrl_ficreg.data.convert.table import Table
+from torchrl_ficreg.data.layout import META_FILE
+
+FORMATS: dict[str, Callable[[Path], Table]] = {
+    "hdf5": HDF5Table,
+    "lance": LanceTable,
+    "ogbench": NpzTable,
+    "lerobot": LeRobotTable,
+}
+
+_KNOWN = (
+    "known are hdf5 (official LeWM files, stable-worldmodel), lance (stable-worldmodel), ogbench (.npz), lerobot (a "
+    "folder with meta/info.json) and, from Python, from_arrays()"
+)
+_PACKED = (".zst", ".gz", ".tar", ".zip", ".xz")
+
+
+def detect_format(path: str | Path) -> str:
+    """Says which of the formats a file or folder has, from its first bytes or its contents.
+
+    Args:
+        path: the file or folder.
+
+    Returns:
+        a key of :data:`FORMATS`.
+
+    Raises:
+        FileNotFoundError: there is nothing at ``path``.
+        ValueError: it is none of them.
+
+    Examples:
+        >>> import tempfile, numpy as np
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     np.savez(f"{folder}/play.npz", terminals=[0, 1])
+        ...     detect_format(f"{folder}/play.npz")
+        'ogbench'
+    """
+    path = Path(path).expanduser()
+    if path.is_dir():
+        return _detect_folder(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no file or folder at {path}: correct the path.")
+    with open(path, "rb") as file:
+        head = file.read(8)
+    if head == b"\x89HDF\r\n\x1a\n":
+        return "hdf5"
+    if head[:4] == b"PK\x03\x04" and path.suffix != ".zip":
+        return "ogbench"
+    if path.suffix in _PACKED:
+        raise ValueError(f"{path} is packed: unpack it first (for .tar.zst: tar --zstd -xf {path.name}).")
+    if head[:7] == b"version":
+        raise ValueError(f"{path} is a pointer to a large file, not the file: fetch it with git lfs pull.")
+    raise ValueError(f"{path} has no known format; {_KNOWN}: name it by format= if it is one of them.")
+
+
+def _detect_folder(path: Path) -> str:
+    if (path / "_versions").is_dir():
+        return "lance"
+    if (path / INFO).is_file():
+        return "lerobot"
+    if (path / META_FILE).is_file():
+        raise ValueError(f"{path} is a dataset of this package already: open it with OfflineTrajectories.")
+    inside = sorted(entry.name for entry in path.iterdir() if entry.suffix in (".h5", ".hdf5", ".lance", ".npz"))
+    if inside:
+        raise ValueError(f"{path} is a folder of data sets: choose one of {', '.join(inside)} in it.")
+    raise ValueError(f"{path} has no known format; {_KNOWN}.")
+
+
+def open_source(
+    path: str | Path,
+    format: str = "auto",
+    *,
+    env: str | None = None,
+    state: str | Sequence[str] | None = None,
+    pixels: str | None = None,
+    action: str | None = None,
+    shift: int = 0,
+    allow_incomplete: bool = False,
+) -> EpisodeSource:
+    """Opens a file or folder of somebody else's episodes.
+
+    Args:
+        path: the file or folder.
+        format: ``"auto"``, or a key of :data:`FORMATS`.
+
+    Keyword Args:
+        env: see :class:`EpisodeSource`, as the other arguments.
+        state: columns that make the state. For example ``["qpos", "qvel"]``.
+        pixels: the column of frames.
+        action: the column of actions.
+        shift: rows by which the actions are moved.
+        allow_incomplete: leave out the episodes that an interrupted recording did not finish.
+
+    Returns:
+        the episodes, to be passed to :func:`convert` and closed after use.
+
+    Raises:
+        FileNotFoundError: there is nothing at ``path``.
+        ImportError: the format needs a package that is missing.
+        KeyError: a column is missing.
+        ValueError: an unknown format, or a file that is damaged, incomplete or laid out otherwise.
+    """
+    path = Path(path).expanduser()
+    if format != "auto" and format not in FORMATS:
+        raise ValueError(f"unknown format {format!r}: choose auto or one of {sorted(FORMATS)}.")
+    if not path.exists():
+        raise FileNotFoundError(f"no file or folder at {path}: correct the path.")
+    table = FORMATS[detect_format(path) if format == "auto" else format](path)
+    try:
+        return EpisodeSource(
+            table, env=env, state=state, pixels=pixels, action=action, shift=shift, allow_incomplete=allow_incomplete
+        )
+    except BaseException:
+        table.close()
+        raise

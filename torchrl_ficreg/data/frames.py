@@ -1,0 +1,238 @@
+"""Frames as they lie on disk: raw rows, or one losslessly compressed image each.
+
+Both are read through ``read(rows)``. A frame that went through a compressed file has the bytes it had before, so
+everything made from frames (batches, checksums, the fingerprint of a dataset) is the same for every format.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import Any, get_args, Literal
+
+import numpy as np
+
+from torchrl_ficreg.data.recycle import Recycler
+from torchrl_ficreg.data.threads import default_threads, run_split
+
+FrameFormat = Literal["raw", "webp", "png"]
+FRAME_FORMATS = get_args(FrameFormat)
+
+# Fast rather than small: WebP's default effort takes three to five times as long for files that are 0 to 16 % smaller;
+# its least effort is three times as fast but makes the flat pictures of PushT seven times as large.
+_SAVE_OPTIONS: dict[str, dict[str, Any]] = {
+    "webp": {"format": "WEBP", "lossless": True, "quality": 20, "method": 1},
+    "png": {"format": "PNG", "compress_level": 6},
+}
+
+# Measured for (TwoRoom, PushT, Reacher, Cube): webp 7-10, 9, 29-44, 39-53 (64-224 px); png 11-16, 14-20, 33-54, 48-65.
+_BYTES_PER_SIDE = {"webp": 60, "png": 80}
+
+_BYTES_PER_THREAD = 4 << 20  # below this a thread costs more than it copies
+
+
+def check_frame_format(frames: str) -> None:
+    """Checks that frames can be kept in this format here.
+
+    Raises:
+        ImportError: the format needs Pillow, or a Pillow with WebP, which is not installed.
+        ValueError: an unknown format.
+
+    Examples:
+        >>> check_frame_format("raw")
+    """
+    if frames not in FRAME_FORMATS:
+        raise ValueError(f"frames must be one of {FRAME_FORMATS}, got {frames!r}.")
+    if frames == "raw":
+        return
+    try:
+        from PIL import features, PngImagePlugin, WebPImagePlugin  # noqa: F401 (importing registers the formats)
+    except ImportError as error:
+        hint = "pip install 'torchrl_ficreg[data]'"
+        raise ImportError(f"frames={frames!r} needs Pillow: {hint}, or record with frames='raw'.") from error
+    if frames == "webp" and not features.check("webp"):
+        hint = "install Pillow from its wheels, or use frames='png'"
+        raise ImportError(f"frames='webp' needs a Pillow with WebP, this one was built without: {hint}.")
+
+
+def frame_bytes(height: int, width: int, frames: FrameFormat) -> int:
+    """Disk space of one frame with what finds it again, in bytes: exact for raw frames, else above the average.
+
+    What an image costs is its edges, whose length grows with its side, not with its area. The factors are a little
+    above the largest of the four environments, Cube.
+    """
+    raw = 3 * height * width
+    return raw if frames == "raw" else min(raw, round(_BYTES_PER_SIDE[frames] * (height * width) ** 0.5)) + 8
+
+
+def encode_frames(pixels: np.ndarray, frames: FrameFormat, *, num_threads: int | None = None) -> list[bytes]:
+    """Compresses frames without loss.
+
+    Args:
+        pixels: uint8 [L, 3, H, W].
+        frames: ``"webp"`` or ``"png"``.
+
+    Keyword Args:
+        num_threads: frames compressed at a time. Default: the usable cores, at most eight.
+
+    Returns:
+        L files, which do not depend on the number of threads.
+
+    Examples:
+        >>> images = encode_frames(np.zeros((2, 3, 64, 64), np.uint8), "png")
+        >>> len(images), images[0] == images[1], len(images[0]) < 200
+        (2, True, True)
+    """
+    check_frame_format(frames)
+    if frames == "raw":
+        raise ValueError("raw frames are rows of bytes, not images: encode to 'webp' or 'png'.")
+    from PIL import Image
+
+    images: list[bytes] = [b""] * len(pixels)
+
+    def work(start: int, stop: int) -> None:
+        for row in range(start, stop):
+            file = io.BytesIO()
+            Image.fromarray(np.ascontiguousarray(pixels[row].transpose(1, 2, 0))).save(file, **_SAVE_OPTIONS[frames])
+            images[row] = file.getvalue()
+
+    run_split(work, len(pixels), num_threads=num_threads or default_threads())
+    return images
+
+
+class RawFrames:
+    """Frames that lie in memory, or in a file mapped into it, as they are.
+
+    Args:
+        array: uint8 [N, 3, H, W].
+
+    Keyword Args:
+        num_threads: threads that copy. Default: the usable cores, at most eight.
+
+    Examples:
+        >>> frames = RawFrames(np.arange(48, dtype=np.uint8).reshape(4, 3, 2, 2))
+        >>> frames.read(np.array([[3, 0]])).shape
+        (1, 2, 3, 2, 2)
+    """
+
+    def __init__(self, array: np.ndarray, *, num_threads: int | None = None) -> None:
+        self._array = np.ascontiguousarray(array)
+        self._num_threads = num_threads or default_threads()
+        self._recycler = Recycler()
+
+    def __len__(self) -> int:
+        return len(self._array)
+
+    def read(self, rows: slice | np.ndarray) -> np.ndarray:
+        """Frames uint8 [..., 3, H, W]: a view for a slice, otherwise a copy. See :meth:`EpisodeStore.frames`."""
+        if isinstance(rows, slice):
+            return self._array[rows]
+        flat = _flat_rows(rows, len(self))  # [N]
+        out = self._recycler.empty((len(flat), *self._array.shape[1:]))
+
+        def work(start: int, stop: int) -> None:
+            # Many times as fast as torch's advanced indexing, and without its thread pool, which belongs to the
+            # training step. "clip" writes into `out` at once; the rows have been checked.
+            np.take(self._array, flat[start:stop], axis=0, out=out[start:stop], mode="clip")
+
+        smallest = max(1, _BYTES_PER_THREAD // max(1, self._array[0].nbytes))
+        run_split(work, len(flat), num_threads=self._num_threads, smallest=smallest)
+        return out.reshape(*np.shape(rows), *out.shape[1:])
+
+
+class ImageFrames:
+    """Frames that are images, one after another in one block of bytes.
+
+    Args:
+        blob: the images.
+        ends: int64 [N], one past the last byte of each.
+        shape: (3, H, W).
+        frames: ``"webp"`` or ``"png"``.
+
+    Keyword Args:
+        num_threads: images decoded at a time: Pillow decodes without holding the interpreter. Default: the usable
+            cores, at most eight. The result does not depend on it.
+
+    Examples:
+        >>> pixels = np.random.default_rng(0).integers(0, 256, (4, 3, 8, 8), dtype=np.uint8)
+        >>> images = encode_frames(pixels, "webp")
+        >>> ends = np.cumsum([len(image) for image in images])
+        >>> frames = ImageFrames(b"".join(images), ends, (3, 8, 8), "webp")
+        >>> bool((frames.read(np.array([3, 1])) == pixels[[3, 1]]).all())
+        True
+    """
+
+    def __init__(
+        self,
+        blob: Any,
+        ends: np.ndarray,
+        shape: tuple[int, ...],
+        frames: FrameFormat,
+        *,
+        num_threads: int | None = None,
+    ) -> None:
+        check_frame_format(frames)
+        self._blob = memoryview(blob)
+        self._ends = ends
+        self._shape = shape
+        self._decode = _decoder(frames, shape)
+        self._num_threads = num_threads or default_threads()
+        self._recycler = Recycler()
+
+    def __len__(self) -> int:
+        return len(self._ends)
+
+    def read(self, rows: slice | np.ndarray) -> np.ndarray:
+        """Decodes frames to a fresh uint8 [..., 3, H, W].
+
+        Raises:
+            ValueError: an image cannot be decoded, or has another size.
+        """
+        if isinstance(rows, slice):
+            rows = np.arange(*rows.indices(len(self)))
+        flat = _flat_rows(rows, len(self))  # [N]
+        out = self._recycler.empty((len(flat), *self._shape))
+
+        def work(start: int, stop: int) -> None:
+            for row, frame in zip(flat[start:stop].tolist(), out[start:stop]):
+                begin = self._ends[row - 1] if row else 0
+                try:
+                    self._decode(self._blob[begin : self._ends[row]], frame)
+                except (ValueError, OSError, SyntaxError, EOFError) as error:  # all of them come out of Pillow
+                    raise ValueError(
+                        f"the image of row {row} is damaged ({error}): restore the files or collect again."
+                    ) from error
+
+        run_split(work, len(flat), num_threads=self._num_threads)
+        return out.reshape(*np.shape(rows), *self._shape)
+
+
+def _flat_rows(rows: np.ndarray, count: int) -> np.ndarray:
+    """Row numbers as int64 [N], all of them checked.
+
+    Raises:
+        IndexError: a row below 0 or beyond the last.
+    """
+    flat = np.asarray(rows, dtype=np.int64).reshape(-1)
+    if flat.size and (flat.min() < 0 or flat.max() >= count):
+        raise IndexError(f"rows run from 0 to {count - 1}, got {flat.min()} to {flat.max()}.")
+    return flat
+
+
+def _decoder(frames: FrameFormat, shape: tuple[int, ...]) -> Callable[[memoryview, np.ndarray], None]:
+    """A function that decodes one image into a frame [3, H, W]."""
+    from PIL import Image
+
+    _, height, width = shape
+    formats = [_SAVE_OPTIONS[frames]["format"]]
+
+    def decode(data: memoryview, frame: np.ndarray) -> None:
+        with Image.open(io.BytesIO(data), formats=formats) as image:
+            if image.mode != "RGB" or image.size != (width, height):
+                got = f"{image.mode} {image.size[1]} x {image.size[0]}"
+                raise ValueError(f"it is {got}, expected RGB {height} x {width}")
+            # Channel by channel: Pillow is twice as fast at pulling one out as numpy at transposing the picture.
+            for channel, name in zip(frame, "RGB"):
+                channel[...] = np.frombuffer(image.tobytes("raw", name), np.uint8).reshape(height, width)
+
+    return decode

@@ -1,0 +1,116 @@
+"""Encoder that looks for things and says where they are."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import nn
+
+from torchrl_ficreg.data.schema import LATENT, PIXELS
+from torchrl_ficreg.modules.batch_norm import GlobalBatchNorm1d
+from torchrl_ficreg.modules.pixels import PixelNormalizer, restore_lead
+
+_STRIDE = 4  # pixels between neighbouring places of a map
+
+
+class SpatialSoftmax(nn.Module):
+    """The expected place of each map's softmax: maps [N, K, H, W] -> coordinates [N, 2 K] in [-1, 1] (arXiv 1504.00702).
+
+    x of all maps first, then y. The temperature is learned.
+
+    Examples:
+        >>> maps = torch.full((1, 1, 3, 3), -50.0)
+        >>> maps[0, 0, 2, 0] = 50.0  # lower left
+        >>> SpatialSoftmax()(maps).tolist()
+        [[-1.0, 1.0]]
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sharpness = nn.Parameter(torch.ones(()))
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        """See the class; float32 whatever the maps are."""
+        height, width = maps.shape[-2:]
+        share = (maps.float() * self.sharpness.float()).flatten(-2).softmax(-1).unflatten(-1, (height, width))  # [N, K, H, W]
+        x = torch.linspace(-1, 1, width, device=maps.device)
+        y = torch.linspace(-1, 1, height, device=maps.device)
+        return torch.cat([(share.sum(-2) * x).sum(-1), (share.sum(-1) * y).sum(-1)], -1)  # [N, 2 K]
+
+
+class KeypointNetwork(nn.Module):
+    """Convolutions at a quarter of the frame's resolution, the place of each map, and a linear layer on the places.
+
+    What a latent can hold is where things are, and smooth functions of it; it cannot be filled with ever finer
+    functions of the one thing that is easiest to predict.
+
+    Args:
+        image_size: H = W of the frames, a multiple of 4.
+        channels: of the three convolutions before the maps.
+        num_keypoints: K, maps.
+        latent_dim: D.
+
+    Raises:
+        ValueError: an image size that is no multiple of 4, or other than three channels.
+    """
+
+    def __init__(
+        self,
+        *,
+        image_size: int = 64,
+        channels: tuple[int, ...] = (32, 64, 64),
+        num_keypoints: int = 32,
+        latent_dim: int = 16,
+    ) -> None:
+        super().__init__()
+        if image_size % _STRIDE:
+            raise ValueError(f"image_size {image_size} must be a multiple of {_STRIDE}, two halvings.")
+        if len(channels) != 3:
+            raise ValueError(f"a keypoint encoder has three convolutions before its maps, got channels {channels}.")
+        first, second, third = channels
+        self.normalize = PixelNormalizer(image_size)
+        # Channels last is the layout that CPU kernels for bfloat16 want.
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(3, first, kernel_size=4, stride=2, padding=1),
+            nn.GELU(),
+            nn.Conv2d(first, second, kernel_size=4, stride=2, padding=1),
+            nn.GELU(),
+            nn.Conv2d(second, third, kernel_size=3, padding=1),
+            nn.GELU(),
+            nn.Conv2d(third, num_keypoints, kernel_size=1),
+        ).to(memory_format=torch.channels_last)
+        self.place = SpatialSoftmax()
+        self.norm = GlobalBatchNorm1d(2 * num_keypoints)
+        self.layer_out = nn.Linear(2 * num_keypoints, latent_dim)
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        """[..., 3, H, W] -> [..., D]."""
+        frames = self.normalize(pixels).contiguous(memory_format=torch.channels_last)  # [N, 3, H, W]
+        maps = self.convolutions(frames)  # [N, K, H / 4, W / 4]
+        # Places are known to a fraction of a pixel, which bfloat16 would round away.
+        with torch.autocast(pixels.device.type, enabled=False):
+            places = self.norm(self.place(maps).to(self.layer_out.weight.dtype))  # [N, 2 K]
+            return restore_lead(self.layer_out(places), pixels)
+
+
+class KeypointEncoder(TensorDictModule):
+    """Encoder for small frames with several moving things: ``pixels`` [..., 3, H, W] -> ``latent`` [..., D].
+
+    Args:
+        in_key, out_key: where frames are read and latents are written.
+        **network: see :class:`KeypointNetwork`.
+
+    Raises:
+        TypeError, ValueError: see :class:`~torchrl_ficreg.modules.pixels.PixelNormalizer`.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> encoder = KeypointEncoder(latent_dim=8).eval()
+        >>> clip = TensorDict({"pixels": torch.rand(2, 4, 3, 64, 64)}, [2, 4])
+        >>> encoder(clip)["latent"].shape
+        torch.Size([2, 4, 8])
+    """
+
+    def __init__(self, *, in_key: NestedKey = PIXELS, out_key: NestedKey = LATENT, **network) -> None:
+        super().__init__(KeypointNetwork(**network), in_keys=[in_key], out_keys=[out_key])

@@ -9,7 +9,8 @@ Steps, in an environment of its own (the package's other dependencies are not ne
     python sota-check/make_golden_push_t.py render states.npz pictures.npz
 
 ``golden`` writes the file that the tests read. ``render`` draws a list of states: it reads ``state`` [N, 7] from one
-npz file and writes ``pixels`` [N, 3, 224, 224] uint8 to the other.
+npz file and writes ``pixels`` [N, 3, 224, 224] uint8 to the other. ``serve`` does so one by one: 7 doubles in on stdin,
+150,528 bytes out on stdout; ``push_t_published_pictures.py`` asks it.
 """
 
 from __future__ import annotations
@@ -98,8 +99,14 @@ def main() -> None:
     render = commands.add_parser("render", help="draw the states of a file")
     render.add_argument("states", type=Path)
     render.add_argument("out", type=Path)
+    commands.add_parser("serve", help="draw states from stdin to stdout")
     args = parser.parse_args()
     env = published_env()
+    if args.command == "serve":
+        while len(state := sys.stdin.buffer.read(7 * 8)) == 7 * 8:
+            sys.stdout.buffer.write(draw(env, np.frombuffer(state).reshape(1, 7)).tobytes())
+            sys.stdout.buffer.flush()
+        return
     args.out.parent.mkdir(parents=True, exist_ok=True)
     if args.command == "render":
         np.savez_compressed(args.out, pixels=draw(env, np.load(args.states)["state"]))

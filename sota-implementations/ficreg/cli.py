@@ -18,6 +18,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
+INTERRUPTED = "interrupted: the same command continues where it stopped."
 CONFIG_DIR = Path(__file__).resolve().parent / "config"
 
 # What a user can cause and mend. A defect of ours shows its traceback, as does everything under HYDRA_FULL_ERROR=1.
@@ -42,7 +43,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
                 main(config)
             except KeyboardInterrupt:
                 _close_bars()
-                sys.exit("interrupted: the same command continues from the last checkpoint.")
+                sys.exit(INTERRUPTED)
             except MISTAKES as error:
                 if os.environ.get("HYDRA_FULL_ERROR") == "1":
                     raise
@@ -55,9 +56,11 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
         def checked() -> None:
             try:
                 check_overrides(config_name, get_args_parser().parse_args().overrides)
+                start()
+            except KeyboardInterrupt:
+                sys.exit(INTERRUPTED)
             except (ValueError, HydraException, OmegaConfBaseException) as error:
                 sys.exit(f"error: {_one_line(error)}")
-            start()
 
         return checked
 

@@ -30,6 +30,7 @@ from torchrl_ficreg import (
     SIGReg,
 )
 from torchrl_ficreg.data import OfflineTrajectories
+from torchrl_ficreg.data.frames import check_frame_format
 from torchrl_ficreg.evaluation import Evaluation, evaluate_mpc, StartGoalPairs, UniformPolicy
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
 from torchrl_ficreg.modules.precision import uses_bf16
@@ -163,6 +164,7 @@ def check_settings(cfg: DictConfig) -> None:
         raise ValueError(f"name={cfg.name!r} must be the plain name of a folder; runs_dir says where that folder goes.")
     if cfg.logger.backend not in ("csv", "wandb", "tensorboard"):
         raise ValueError(f"unknown logger.backend {cfg.logger.backend!r}: choose csv, wandb or tensorboard.")
+    check_frame_format(cfg.collect.frames)
     model, inverse_model = make_world_model(model_config(cfg), action_dim=1)
     make_loss(cfg, model, inverse_model)
     if cfg.loss.sigreg_start is not None and not (cfg.loss.sigreg_start > 0 and cfg.loss.sigreg_coeff > 0):

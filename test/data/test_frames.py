@@ -433,3 +433,10 @@ def _read(store, rows):
 
 if __name__ == "__main__":
     pytest.main([__file__])
+
+
+@pytest.mark.parametrize("rows", [np.array([True, False]), np.array([0.0, 1.0])])
+def test_rows_that_are_not_integers_are_refused(rows):
+    frames = RawFrames(np.zeros((2, 3, 4, 4), np.uint8))
+    with pytest.raises(TypeError, match="rows are picked by integers"):
+        frames.read(rows)

@@ -44,7 +44,7 @@ def episode(arm, steps, **arguments):
 
 def test_without_noise_it_carries_the_cube_to_the_goal_and_puts_it_back_there_again(arm):
     """A plan takes 4.4 s, 88 steps, give or take: the second one lifts the cube where it lies."""
-    states, actions, goal = episode(arm, 200, noise=0.0)
+    states, actions, goal = episode(arm, 200, noise_std=0.0)
     near = position_reached(states, goal)
     assert not near[0]
     assert 50 < near.argmax() < 90
@@ -79,15 +79,15 @@ def test_the_environment_it_is_given_only_answers_questions(arm):
 
 
 def test_noise_is_added_to_the_plan(arm):
-    quiet, noisy = (episode(arm, 60, rng=np.random.default_rng(1), noise=noise)[1] for noise in (0.0, 0.1))
+    quiet, noisy = (episode(arm, 60, rng=np.random.default_rng(1), noise_std=noise)[1] for noise in (0.0, 0.1))
     assert np.abs(np.diff(noisy, axis=0)).mean() > 2 * np.abs(np.diff(quiet, axis=0)).mean()
 
 
 def test_bad_arguments_are_refused():
     import gymnasium
 
-    with pytest.raises(ValueError, match="noise must be finite and not negative, got -1"):
-        CubeExpert(noise=-1)
+    with pytest.raises(ValueError, match="noise_std must be finite and not negative, got -1"):
+        CubeExpert(noise_std=-1)
     with pytest.raises(ValueError, match="noise_smoothing must be finite and positive, got 0"):
         CubeExpert(noise_smoothing=0)
     with pytest.raises(TypeError, match="env must be a CubeEnv, got CartPoleEnv"):

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_ficreg import ConvEncoder, KeypointEncoder, ViTEncoder
-from torchrl_ficreg.modules.keypoints import SpatialSoftmax
+from torchrl_ficreg.modules.keypoints import spatial_softmax
 from torchrl_ficreg.modules.pixels import IMAGENET_MEAN, IMAGENET_STD, PixelNormalizer
 
 BUILD = {
@@ -119,12 +119,12 @@ def test_a_spatial_softmax_tells_where_the_mass_of_a_map_is():
     place = torch.rand(6, 2) - 0.5  # [N, (x, y)]
     grid = torch.linspace(-1, 1, 33)
     squared = (grid[None, None, :] - place[:, 0, None, None]) ** 2 + (grid[None, :, None] - place[:, 1, None, None]) ** 2
-    found = SpatialSoftmax()(-squared[:, None] / (2 * 0.1**2))  # [N, 2]
+    found = spatial_softmax(-squared[:, None] / (2 * 0.1**2))  # [N, 2]
     torch.testing.assert_close(found, place, atol=1e-3, rtol=0)
 
 
 def test_a_keypoint_encoder_refuses_frames_and_layers_it_cannot_halve_twice():
-    with pytest.raises(ValueError, match="multiple of 4"):
+    with pytest.raises(ValueError, match="positive multiple of 4"):
         KeypointEncoder(image_size=30)
     with pytest.raises(ValueError, match="three convolutions"):
         KeypointEncoder(channels=(8, 8))

@@ -21,7 +21,7 @@ def scripts(monkeypatch):
     """Imports a module of the scripts into this process: a new one for every misspelling would be slow."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     yield importlib.import_module
-    for name in ("cli", "utils", "run_dir"):
+    for name in ("cli", "utils", "run_dir", "episodes"):
         sys.modules.pop(name, None)
 
 
@@ -99,6 +99,9 @@ def refused(done, *words):
         (["logger.backend=paper"], "unknown logger.backend 'paper'"),
         (["device=quantum"], "device=quantum cannot be used here"),
         (["model.encoder=mlp"], "unknown encoder 'mlp'"),
+        (["loss.sigreg_start=0.1", "loss.sigreg_coeff=0.0"], "must be positive to fall from one to the other"),
+        (["evaluation.num_workers=0"], "must be positive: evaluation.num_workers=0"),
+        (["collect.frames=jpeg"], "jpeg"),
     ],
 )
 def test_settings_out_of_range_are_found_before_anything_is_written(scripts, overrides, message):
@@ -131,6 +134,13 @@ def test_a_name_is_not_lost_to_a_configuration_that_never_trained(trained, execu
     done = execute(tmp_path, "train.py", "name=mine", "env.goal_offset=1")
     assert done.returncode == 0, done.stderr  # and with all pairs solved at the start, there is a report all the same
     assert "-" in done.stdout.splitlines()[2].split()
+
+
+def test_a_dataset_of_other_frames_or_another_environment_is_refused(trained, execute, tmp_path):
+    data = trained / "data" / "two_room_32px_20episodes_seed0"
+    refused(execute(tmp_path, "train.py", f"dataset={data}", "env=push_t"), "are of two_room: give env=two_room")
+    refused(execute(tmp_path, "train.py", f"dataset={data}", "model.image_size=64"), "frames of 32 pixels")
+    assert not list(tmp_path.iterdir())
 
 
 def test_too_few_episodes_for_the_pairs_are_found_before_training(trained, execute, tmp_path):

@@ -212,8 +212,12 @@ def _flat_rows(rows: np.ndarray, count: int) -> np.ndarray:
 
     Raises:
         IndexError: a row below 0 or beyond the last.
+        TypeError: rows that are not integers, such as a mask.
     """
-    flat = np.asarray(rows, dtype=np.int64).reshape(-1)
+    rows = np.asarray(rows)
+    if rows.size and rows.dtype.kind not in "iu":
+        raise TypeError(f"rows are picked by integers, got an index of {rows.dtype}.")
+    flat = rows.astype(np.int64).reshape(-1)
     if flat.size and (flat.min() < 0 or flat.max() >= count):
         raise IndexError(f"rows run from 0 to {count - 1}, got {flat.min()} to {flat.max()}.")
     return flat

@@ -99,6 +99,8 @@ def make_env(
         raise ValueError(f"num_envs must be at least 1, got {num_envs}.")
     if num_workers is not None and not 1 <= num_workers <= num_envs:
         raise ValueError(f"num_workers must be None or in 1..num_envs ({num_envs}), got {num_workers}.")
+    if seed is not None and seed < 0:
+        raise ValueError(f"seed must not be negative, got {seed}.")
     if max_episode_steps is not None and max_episode_steps < 1:
         raise ValueError(f"max_episode_steps must be at least 1, or None for no limit, got {max_episode_steps}.")
     create = functools.partial(

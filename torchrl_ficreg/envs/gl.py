@@ -7,6 +7,7 @@ order that keeps every library quiet, be it by ``close``, by the garbage collect
 from __future__ import annotations
 
 import atexit
+import ctypes
 import functools
 import importlib
 import os
@@ -61,9 +62,9 @@ def import_mujoco() -> ModuleType:
 def import_simulator(name: str) -> ModuleType:
     """Imports MuJoCo, or a module built on it, such that it draws without a window.
 
-    On Linux, sets ``MUJOCO_GL=egl`` for all of them unless the user has set it. They load the GL library as they are
-    imported; on a machine without it they are imported all the same: they simulate, and :class:`OffscreenRenderer`
-    says what is missing.
+    On Linux, sets ``MUJOCO_GL=egl`` for all of them where there is an EGL library, unless the user has set it. They load
+    the GL library as they are imported; on a machine without it they are imported all the same: they simulate, and
+    :class:`OffscreenRenderer` says what is missing.
 
     Args:
         name: of the module, for instance ``"mujoco"`` or ``"ogbench.manipspace"``.
@@ -78,7 +79,7 @@ def import_simulator(name: str) -> ModuleType:
         >>> import_simulator("mujoco").__name__
         'mujoco'
     """
-    if platform.system() == "Linux":  # elsewhere MuJoCo refuses the value and needs no help
+    if _has_egl():  # worker processes inherit the variable: without the library they could not even import TorchRL
         os.environ.setdefault(BACKEND_VARIABLE, "egl")
     try:
         return importlib.import_module(name)
@@ -87,6 +88,21 @@ def import_simulator(name: str) -> ModuleType:
     except (AttributeError, ImportError, OSError, RuntimeError):  # PyOpenGL trips over a None without its library
         with environment_variables({BACKEND_VARIABLE: _OFF}):
             return importlib.import_module(name)
+
+
+def _has_egl() -> bool:
+    if platform.system() != "Linux":  # elsewhere MuJoCo refuses the value and needs no help
+        return False
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        return False
+    return True
+
+
+def _backend() -> str:
+    default = "egl" if platform.system() == "Linux" else ""
+    return os.environ.get(BACKEND_VARIABLE, default).strip().lower()
 
 
 def gl_works() -> bool:
@@ -99,7 +115,7 @@ def gl_works() -> bool:
         >>> isinstance(gl_works(), bool)
         True
     """
-    return _probe(os.environ.get(BACKEND_VARIABLE, "egl" if platform.system() == "Linux" else ""))
+    return _probe(_backend())
 
 
 @functools.cache
@@ -205,7 +221,7 @@ class _Surface:
 
     def __init__(self, model: mujoco.MjModel, size: int) -> None:
         self._mujoco = import_mujoco()
-        backend = os.environ.get(BACKEND_VARIABLE, "").strip().lower()
+        backend = _backend()
         self._gl = None
         try:
             self._gl = _context_class(backend)(size, size)

@@ -14,29 +14,27 @@ from torchrl_ficreg.modules.pixels import PixelNormalizer, restore_lead
 _STRIDE = 4  # pixels between neighbouring places of a map
 
 
-class SpatialSoftmax(nn.Module):
-    """The expected place of each map's softmax: maps [N, K, H, W] -> coordinates [N, 2 K] in [-1, 1] (arXiv 1504.00702).
+def spatial_softmax(maps: torch.Tensor) -> torch.Tensor:
+    """The expected place of each map's softmax (arXiv 1504.00702), in float32 whatever the maps are.
 
-    x of all maps first, then y. The temperature is learned.
+    Args:
+        maps: [N, K, H, W].
+
+    Returns:
+        [N, 2 K] in [-1, 1]: x of all maps, then y; -1 is left and top.
 
     Examples:
         >>> maps = torch.full((1, 1, 3, 3), -50.0)
         >>> maps[0, 0, 2, 0] = 50.0  # lower left
-        >>> SpatialSoftmax()(maps).tolist()
+        >>> spatial_softmax(maps).tolist()
         [[-1.0, 1.0]]
     """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.sharpness = nn.Parameter(torch.ones(()))
-
-    def forward(self, maps: torch.Tensor) -> torch.Tensor:
-        """See the class; float32 whatever the maps are."""
-        height, width = maps.shape[-2:]
-        share = (maps.float() * self.sharpness.float()).flatten(-2).softmax(-1).unflatten(-1, (height, width))  # [N, K, H, W]
-        x = torch.linspace(-1, 1, width, device=maps.device)
-        y = torch.linspace(-1, 1, height, device=maps.device)
-        return torch.cat([(share.sum(-2) * x).sum(-1), (share.sum(-1) * y).sum(-1)], -1)  # [N, 2 K]
+    height, width = maps.shape[-2:]
+    x = torch.linspace(-1, 1, width, device=maps.device)
+    y = torch.linspace(-1, 1, height, device=maps.device)
+    grid = torch.stack([x.repeat(height), y.repeat_interleave(width)], -1)  # [H * W, 2]
+    share = maps.float().flatten(-2).softmax(-1)  # [N, K, H * W]
+    return (share @ grid).transpose(-1, -2).flatten(-2)  # [N, K, 2] -> [N, 2 K]
 
 
 class KeypointNetwork(nn.Module):
@@ -64,8 +62,8 @@ class KeypointNetwork(nn.Module):
         latent_dim: int = 16,
     ) -> None:
         super().__init__()
-        if image_size % _STRIDE:
-            raise ValueError(f"image_size {image_size} must be a multiple of {_STRIDE}, two halvings.")
+        if image_size < _STRIDE or image_size % _STRIDE:
+            raise ValueError(f"image_size {image_size} must be a positive multiple of {_STRIDE}, two halvings.")
         if len(channels) != 3:
             raise ValueError(f"a keypoint encoder has three convolutions before its maps, got channels {channels}.")
         first, second, third = channels
@@ -80,7 +78,6 @@ class KeypointNetwork(nn.Module):
             nn.GELU(),
             nn.Conv2d(third, num_keypoints, kernel_size=1),
         ).to(memory_format=torch.channels_last)
-        self.place = SpatialSoftmax()
         self.norm = GlobalBatchNorm1d(2 * num_keypoints)
         self.layer_out = nn.Linear(2 * num_keypoints, latent_dim)
 
@@ -90,7 +87,7 @@ class KeypointNetwork(nn.Module):
         maps = self.convolutions(frames)  # [N, K, H / 4, W / 4]
         # Places are known to a fraction of a pixel, which bfloat16 would round away.
         with torch.autocast(pixels.device.type, enabled=False):
-            places = self.norm(self.place(maps).to(self.layer_out.weight.dtype))  # [N, 2 K]
+            places = self.norm(spatial_softmax(maps).to(self.layer_out.weight.dtype))  # [N, 2 K]
             return restore_lead(self.layer_out(places), pixels)
 
 

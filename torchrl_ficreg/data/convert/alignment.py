@@ -95,8 +95,10 @@ def _fit(episodes: list[tuple[np.ndarray, np.ndarray]], change: str) -> Alignmen
         base = _residual(known, changed)
         left = _residual(np.concatenate([known, given], 1), changed)
         with np.errstate(divide="ignore", invalid="ignore"):
-            # A component that does not change has nothing to explain.
-            per_lag[lag] = np.where(base > 1e-12 * (1 + (changed**2).sum(0)), 1 - left / base, 0.0)
+            # A component that does not change has nothing to explain; one whose squares overflow, or that has too few
+            # rows, tells nothing.
+            share = np.where(base > 1e-12 * (1 + (changed**2).sum(0)), 1 - left / base, 0.0)
+            per_lag[lag] = np.where(np.isfinite(share), share, 0.0)
     width = min(episodes[0][0].shape[1], episodes[0][1].shape[1])
     best = np.argsort(-np.max(list(per_lag.values()), axis=0))[:width]
     return Alignment({lag: float(r2[best].mean()) for lag, r2 in per_lag.items()}, change, rows)

@@ -61,6 +61,11 @@ def to_array(values: Any, column: Column) -> np.ndarray:
             raise ValueError("a frame holds no bytes: it refers to a file outside the table")
         return decode(cells)
     flat = values.combine_chunks()
-    for _ in column.shape:
+    compute = require("pyarrow.compute", "pylance")
+    for width in column.shape:
+        # Compared one by one: a short list and a long one may add up to the right number of values.
+        widths = compute.unique(compute.list_value_length(flat)).to_pylist()
+        if widths not in ([width], []):
+            raise ValueError(f"lists of {width} values were expected, got lengths {widths[:8]}")
         flat = flat.flatten()
     return flat.to_numpy(zero_copy_only=False).reshape(len(values), *column.shape)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from pathlib import Path
 from typing import IO
 
@@ -43,11 +44,14 @@ class NpzTable(Table):
             raise ValueError(f"{path} cannot be opened ({error}): it is damaged or incomplete, copy it again.") from error
         try:
             names = [name.removesuffix(".npy") for name in self._archive.namelist()]
-            self._members = {name: _Member(self._archive, name) for name in names}
-            if TERMINALS not in self._members:
+            if TERMINALS not in names:
                 raise ValueError(f"{path} has no {TERMINALS!r}, got {sorted(names)}: use from_arrays(..., lengths=...).")
+            self._members = {name: _Member(self._archive, name) for name in names}
             columns = {name: member.column for name, member in self._members.items()}
             super().__init__(path, columns, *_bounds(self._members[TERMINALS], path))
+        except (OSError, EOFError, NotImplementedError, zlib.error, zipfile.BadZipFile) as error:
+            self._archive.close()
+            raise ValueError(f"{path} cannot be read ({error}): it is damaged, copy it again.") from error
         except BaseException:
             self._archive.close()
             raise

@@ -179,6 +179,11 @@ class EpisodeSource:
         for block in range(start, stop, _BLOCK_ROWS):
             end = min(block + _BLOCK_ROWS, stop)
             images = to_frames(self._read(self.columns[PIXELS][0], block, end))
+            if images.shape[2:] != self.frame_shape:
+                raise ValueError(
+                    f"{self.table.path}: the frames of rows {block} to {end} are {images.shape[2:]}, those of the "
+                    f"first row {self.frame_shape}: frames must have one size."
+                )
             frames[block - start : end - start] = resize(images, size)
         return frames
 

@@ -174,8 +174,8 @@ def _check_arguments(
         raise ValueError(f"the source was opened with env={source.env!r}, got env={env!r}: pass env= to open_source().")
     check_frame_format(frames)
     for name, value in (("image_size", image_size), ("limit", limit)):
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}.")
+        if value is not None and (not isinstance(value, int) or value < 1):
+            raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
 
 
 def _bounds(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args, Literal
+from typing import Any, ClassVar, get_args, Literal
 
 import numpy as np
 from gymnasium import spaces
@@ -22,6 +22,7 @@ from torchrl_ficreg.envs.cube.rendering import check_detail, Detail, render
 SuccessRule = Literal["position", "pose"]
 
 _UNIT_SLACK = 1e-3  # of the length of a quaternion: recorded ones may have been stored as float32
+_LARGEST = 1e4  # of all positions and velocities, far beyond what the arm can do
 _FARTHEST = 2.0  # m from the foot of the arm, beyond anything it could throw a cube to
 
 
@@ -53,7 +54,7 @@ class CubeEnv(GoalEnv):
         ((5,), (41,))
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
 
     def __init__(
         self, *, success_on: SuccessRule = "position", detail: Detail = "pixel", **kwargs: Any
@@ -97,6 +98,8 @@ class CubeEnv(GoalEnv):
                 f"numbers 17 to 20 are the quaternion of the cube, of length 1, but have length {length:.3g}: "
                 "a state is qpos [21] followed by qvel [20]"
             )
+        if np.abs(state).max() > _LARGEST:
+            return f"a number is beyond {_LARGEST:.0f}, where MuJoCo would start anew"
         position = state[CUBE_POSITION]
         if position[2] < 0 or np.abs(position).max() > _FARTHEST:
             return f"the cube is below the floor or more than {_FARTHEST} m away, at {position.tolist()}"

@@ -26,11 +26,11 @@ class CubeExpert:
             NumPy's global generator, which the oracle draws from, is seeded from it and put back each time.
         env: the :class:`~torchrl_ficreg.envs.cube.env.CubeEnv` it acts in; its simulator answers where the gripper is
             in a state and is left alone otherwise. By default the expert has a simulator of its own.
-        noise: standard deviation of the noise of the plan, in units of the action.
+        noise_std: standard deviation of the noise of the plan, in units of the action.
         noise_smoothing: standard deviation of the Gaussian that smooths the noise in time, in steps.
 
     Raises:
-        ValueError: ``noise`` is negative or ``noise_smoothing`` not positive.
+        ValueError: ``noise_std`` is negative or ``noise_smoothing`` not positive.
         TypeError: ``env`` is no CubeEnv.
         ImportError: MuJoCo or ogbench is not installed.
 
@@ -48,11 +48,11 @@ class CubeExpert:
         *,
         rng: np.random.Generator | None = None,
         env: Any = None,
-        noise: float = 0.1,
+        noise_std: float = 0.1,
         noise_smoothing: float = 0.5,
     ) -> None:
-        if not 0 <= noise < np.inf:
-            raise ValueError(f"noise must be finite and not negative, got {noise}.")
+        if not 0 <= noise_std < np.inf:
+            raise ValueError(f"noise_std must be finite and not negative, got {noise_std}.")
         if not 0 < noise_smoothing < np.inf:
             raise ValueError(f"noise_smoothing must be finite and positive, got {noise_smoothing}.")
         arm = CubeArm() if env is None else getattr(env.unwrapped, "arm", None)
@@ -62,7 +62,7 @@ class CubeExpert:
 
         self._arm = arm
         self._rng = np.random.default_rng(0) if rng is None else rng
-        self._oracle = CubePlanOracle(env=arm.ogbench, noise=noise, noise_smoothing=noise_smoothing)
+        self._oracle = CubePlanOracle(env=arm.ogbench, noise=noise_std, noise_smoothing=noise_smoothing)
         self._steps = 0
 
     def __call__(self, state: np.ndarray, goal_state: np.ndarray) -> np.ndarray:

@@ -11,6 +11,8 @@ from torchrl_ficreg.envs.base import GoalEnv
 from torchrl_ficreg.envs.gl import OffscreenRenderer, import_mujoco
 from torchrl_ficreg.envs.reacher import physics
 
+_LARGEST = 1e4  # of all angles and velocities, far beyond what the motors can do
+
 
 class ReacherEnv(GoalEnv):
     """Turn the two joints of a planar arm by their motors until both angles are those of the goal.
@@ -102,6 +104,8 @@ class ReacherEnv(GoalEnv):
 
     def _why_illegal(self, state: np.ndarray) -> str | None:
         limit = physics.WRIST_LIMIT + physics.WRIST_SLACK
+        if np.abs(state).max() > _LARGEST:
+            return f"a number is beyond {_LARGEST:.0f}, where MuJoCo would start anew"
         if abs(state[1]) <= limit:
             return None
         return f"the wrist's stop at +-{physics.WRIST_LIMIT:.4f} rad never yields beyond +-{limit:.4f} rad"

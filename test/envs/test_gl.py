@@ -1,7 +1,7 @@
 """GL is touched late, given back quietly, and its absence is explained.
 
-What happens at an interpreter's exit, or without a library, is tried in interpreters of its own. They load the module
-from its file: the package around it imports MuJoCo by way of TorchRL, whose first contact is part of the claim.
+What happens at an interpreter's exit, or without a library, is tried in interpreters of its own, in which TorchRL loads
+MuJoCo before this package can.
 """
 
 from __future__ import annotations
@@ -29,34 +29,35 @@ SCENE = """
   <camera name="near" pos=".3 .2 1"/>
 </worldbody></mujoco>
 """
+LACK = """
+import ctypes, ctypes.util
+def without(library):
+    init, find = ctypes.CDLL.__init__, ctypes.util.find_library
+    def refuse(self, name=None, *args, **kwargs):
+        if library in str(name):
+            raise OSError(f"{name}: cannot open shared object file")
+        init(self, name, *args, **kwargs)
+    ctypes.CDLL.__init__ = refuse
+    ctypes.util.find_library = lambda name: None if name in library else find(name)
+"""
 LOAD = f"""
-import ctypes, importlib.util, os, sys
-spec = importlib.util.spec_from_file_location("gl", {gl.__file__!r})
-gl = importlib.util.module_from_spec(spec)
-sys.modules["gl"] = gl
-spec.loader.exec_module(gl)
+import ctypes, os, sys
+from torchrl_ficreg.envs import gl
 def scene():
     mujoco = gl.import_mujoco()
     model = mujoco.MjModel.from_xml_string({SCENE!r})
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     return model, data
-def without(library):
-    init = ctypes.CDLL.__init__
-    def refuse(self, name=None, *args, **kwargs):
-        if library in str(name):
-            raise OSError(f"{{name}}: cannot open shared object file")
-        init(self, name, *args, **kwargs)
-    ctypes.CDLL.__init__ = refuse
 """
 
 
-def python(code: str, folder: Path, **variables: str) -> subprocess.CompletedProcess:
-    """Runs code in a fresh interpreter without a display, in which every warning is an error."""
+def python(code: str, folder: Path, lacks: str = "", **variables: str) -> subprocess.CompletedProcess:
+    """Runs code in a fresh interpreter without a display and without a library, in which every warning is an error."""
     names = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "PYTHONPATH")
     environment = {key: value for key, value in os.environ.items() if key not in names} | variables
     script = folder / "script.py"
-    script.write_text(LOAD + code)
+    script.write_text(LACK + (f"without({lacks!r})\n" if lacks else "") + LOAD + code)
     command = [sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning", str(script)]
     return subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
 
@@ -150,14 +151,13 @@ def test_renderers_do_not_disturb_each_other(scene):
 def test_only_drawing_needs_gl(tmp_path):
     """Without the library one simulates; the first picture names the packages and the alternative."""
     code = """
-without("libEGL")
 model, data = scene()
 renderer = gl.OffscreenRenderer(model, size=16)
 gl.import_mujoco().mj_step(model, data)
 print(data.time)
 renderer.draw(data, 0)
 """
-    result = python(code, tmp_path)
+    result = python(code, tmp_path, lacks="libEGL")
     assert result.stdout.strip() == "0.002"
     message = result.stderr.strip().splitlines()[-1]
     assert message.startswith("RuntimeError: cannot draw with MUJOCO_GL='egl'")
@@ -166,10 +166,10 @@ renderer.draw(data, 0)
     assert "Exception ignored" not in result.stderr
 
 
-@pytest.mark.parametrize("backend", ["glfw", "osmesa", "off"])
+@pytest.mark.parametrize("backend", ["glfw", "osmesa", "off", "nonsense"])
 def test_a_backend_that_cannot_draw_here_is_named(backend, tmp_path):
-    code = "without('OSMesa'); model, data = scene(); gl.OffscreenRenderer(model, size=16).draw(data, 0)"
-    result = python(code, tmp_path, MUJOCO_GL=backend, PYTHONWARNINGS="ignore")
+    code = "model, data = scene(); gl.OffscreenRenderer(model, size=16).draw(data, 0)"
+    result = python(code, tmp_path, lacks="OSMesa", MUJOCO_GL=backend, PYTHONWARNINGS="ignore")
     assert f"RuntimeError: cannot draw with MUJOCO_GL='{backend}'" in result.stderr
     assert "apt-get install libegl1 libgl1" in result.stderr
     assert "Exception ignored" not in result.stderr

@@ -91,13 +91,10 @@ def import_simulator(name: str) -> ModuleType:
 
 
 def _has_egl() -> bool:
-    if platform.system() != "Linux":  # elsewhere MuJoCo refuses the value and needs no help
-        return False
     try:
-        ctypes.CDLL("libEGL.so.1")
+        return platform.system() == "Linux" and bool(ctypes.CDLL("libEGL.so.1"))  # elsewhere MuJoCo refuses the value
     except OSError:
         return False
-    return True
 
 
 def _backend() -> str:

@@ -95,7 +95,7 @@ class PushTExpert:
         """Chooses the next action.
 
         Args:
-            state: [7] float64, see :mod:`~torchrl_ficreg.envs.push_t.physics`.
+            state: [7] float64, see :mod:`~torchrl_ficreg.envs.push_t.shapes`.
             goal_state: [7] float64; looked at in the first step only.
 
         Returns:

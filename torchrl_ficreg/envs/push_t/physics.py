@@ -23,29 +23,8 @@ from torchrl_ficreg.envs.push_t.shapes import (
     WALL_HIGH,
     WALL_LOW,
     WALL_RADIUS,
-    WINDOW,
     wrap,
 )
-
-__all__ = [
-    "ACTION_SCALE",
-    "AGENT_RADIUS",
-    "BAR",
-    "BLOCK_MASS",
-    "BLOCK_MOMENT",
-    "CENTER_OF_GRAVITY",
-    "DAMPING",
-    "STATE_SIZE",
-    "STEM",
-    "STIFFNESS",
-    "SUBSTEPS",
-    "TIME_STEP",
-    "WALL_HIGH",
-    "WALL_LOW",
-    "WALL_RADIUS",
-    "WINDOW",
-    "PushTWorld",
-]
 
 BLOCK_MASS, BLOCK_MOMENT = 1.0, 3000.0
 
@@ -60,7 +39,7 @@ class PushTWorld:
     The disc is kinematic: it pushes the block, nothing pushes it, and walls do not stop it. Space has no friction and
     a damping that stills the block between two contacts.
 
-    State: [7] float64, see ``STATE_SIZE``.
+    State: [7] float64, see :mod:`torchrl_ficreg.envs.push_t.shapes`.
 
     Args:
         relative: an action shifts the target from where the disc is, by 100 px per unit; otherwise it is the target

@@ -18,10 +18,10 @@ def main(cfg: DictConfig) -> None:
     """Loads, plans on the frozen pairs, writes."""
     if OmegaConf.is_missing(cfg, "checkpoint"):
         raise ValueError("name the model to evaluate: checkpoint=runs/two_room_cpu_ficreg_seed0, say.")
-    if cfg.budget is not None and cfg.budget < 1 or cfg.num_envs < 1 or cfg.record < 0:
+    if cfg.budget is not None and cfg.budget < 1 or cfg.num_envs < 1 or min(cfg.record, cfg.num_workers) < 0:
         raise ValueError(
-            f"budget and num_envs must be positive and record not negative, got {cfg.budget}, {cfg.num_envs} and "
-            f"{cfg.record}."
+            "budget and num_envs must be positive, record and num_workers not negative, got "
+            f"{cfg.budget}, {cfg.num_envs}, {cfg.record} and {cfg.num_workers}."
         )
     checkpoint = find_checkpoint(cfg.checkpoint)
     run_dir = checkpoint.parent.parent

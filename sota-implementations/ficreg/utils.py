@@ -143,10 +143,11 @@ def make_policy(plan: DictConfig, model: LatentWorldModel, low: list[float], hig
 
 
 def evaluate_beside_random(
-    policy: MPCPolicy, pairs: StartGoalPairs, card: ModelCard, *, record: int, **settings: Any
+    policy: MPCPolicy, pairs: StartGoalPairs, card: ModelCard, *, record: int, num_workers: int, **settings: Any
 ) -> tuple[Evaluation, Evaluation]:
     """A policy, and uniformly random actions, on the same pairs in the environment that a model was trained on."""
     shared = {"image_size": card.model["image_size"], "env_kwargs": card.env_kwargs, **settings}
+    shared["num_workers"] = num_workers or None
     outcome = evaluate_mpc(policy, pairs, record=record, description="plan", **shared)
     floor = evaluate_mpc(UniformPolicy(card.action_low, card.action_high), pairs, description="random", **shared)
     return outcome, floor
@@ -182,12 +183,11 @@ def check_settings(cfg: DictConfig) -> None:
     positive |= {"evaluation.record": evaluation.record, "logger.interval": cfg.logger.interval}
     positive |= {"logger.alarm_interval": cfg.logger.alarm_interval}
     positive |= {"optim.validation_batches": optim.validation_batches, "env.data.max_steps": cfg.env.data.max_steps}
-    if evaluation.num_workers is not None:
-        positive |= {"evaluation.num_workers": evaluation.num_workers}
     wrong = [f"{key}={value}" for key, value in positive.items() if not value > 0]
     if wrong:
         raise ValueError(f"must be positive: {', '.join(wrong)}.")
     natural = {"seed": cfg.seed, "env.data.seed": cfg.env.data.seed, "evaluation.seed": evaluation.seed}
+    natural |= {"evaluation.num_workers": evaluation.num_workers}
     natural |= {"collect.num_workers": cfg.collect.num_workers, "optim.weight_decay": optim.weight_decay}
     wrong = [f"{key}={value}" for key, value in natural.items() if not 0 <= value < 2**63]
     if wrong:

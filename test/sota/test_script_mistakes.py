@@ -100,7 +100,7 @@ def refused(done, *words):
         (["device=quantum"], "device=quantum cannot be used here"),
         (["model.encoder=mlp"], "unknown encoder 'mlp'"),
         (["loss.sigreg_start=0.1", "loss.sigreg_coeff=0.0"], "must be positive to fall from one to the other"),
-        (["evaluation.num_workers=0"], "must be positive: evaluation.num_workers=0"),
+        (["evaluation.num_workers=-1"], "must not be negative nor exceed 63 bits: evaluation.num_workers=-1"),
         (["collect.frames=jpeg"], "jpeg"),
     ],
 )

@@ -335,7 +335,7 @@ def test_models_that_lewm_cannot_stand_for_are_not_written(tiny_world, sizes, me
 
 
 def test_foreign_networks_and_namings_are_refused(linear_world, tiny, tmp_path):
-    with pytest.raises(TypeError, match=r"own networks .* \(ConvNetwork, VisionTransformer\), got Corner"):
+    with pytest.raises(TypeError, match=r"own networks .* \(ConvNetwork, KeypointNetwork, VisionTransformer\), got Corner"):
         save_lewm(linear_world(), tmp_path)
     with pytest.raises(ValueError, match="naming must be 'transformers4' or 'transformers5', got 'timm'"):
         save_lewm(tiny, tmp_path, naming="timm")

@@ -2,12 +2,12 @@
 
 The published package is no dependency of ours. Steps, in an environment of its own:
 
-    python3 -m venv /tmp/published
-    /tmp/published/bin/pip install torch==2.13.0 transformers==5.23.0 einops==0.8.2
-    /tmp/published/bin/pip install --no-deps stable-worldmodel==0.1.1
-    /tmp/published/bin/python sota-check/make_golden_lewm.py            # writes the files
-    /tmp/published/bin/pip install transformers==4.57.6
-    /tmp/published/bin/python sota-check/make_golden_lewm.py --check    # the older names give the same numbers
+    python3 -m venv published
+    published/bin/pip install torch==2.13.0 transformers==5.23.0 einops==0.8.2
+    published/bin/pip install --no-deps stable-worldmodel==0.1.1
+    published/bin/python sota-check/make_golden_lewm.py            # writes the files
+    published/bin/pip install transformers==4.57.6
+    published/bin/python sota-check/make_golden_lewm.py --check    # the older names give the same numbers
 
 LeWM and its predictor, action encoder and projectors run as published: ``stable_worldmodel.wm.lewm``, imported without
 the rest of its package, which wants simulators. Its encoder, ``stable_pretraining``'s ``vit_hf``, is a ``ViTModel`` of

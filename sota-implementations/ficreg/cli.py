@@ -56,11 +56,12 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
         def checked() -> None:
             try:
                 check_overrides(config_name, get_args_parser().parse_args().overrides)
-                start()
-            except KeyboardInterrupt:
-                sys.exit(INTERRUPTED)
             except (ValueError, HydraException, OmegaConfBaseException) as error:
                 sys.exit(f"error: {_one_line(error)}")
+            try:
+                start()  # what it raises has been put into words, or is wanted whole (HYDRA_FULL_ERROR)
+            except KeyboardInterrupt:
+                sys.exit(INTERRUPTED)
 
         return checked
 

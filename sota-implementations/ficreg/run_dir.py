@@ -13,7 +13,8 @@ from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS
 from torchrl_ficreg.trainers.offline import METRICS
 
 # Settings that change neither the weights nor how they are reached; a finished run may be given others.
-_FREE = ("collect.", "device", "evaluation.", "plan.", "logger.", "env.budget", "env.goal_offset", "env.state_unit")
+_FREE = ("collect.", "device", "evaluation.", "plan.", "logger.")
+_FREE += ("env.budget", "env.goal_offset", "env.num_workers", "env.state_unit")
 
 
 def check_run_dir(cfg: DictConfig) -> Path:

@@ -36,7 +36,6 @@ from torchrl_ficreg.modules.inverse import InverseDynamicsModel
 from torchrl_ficreg.modules.precision import uses_bf16
 from torchrl_ficreg.trainers import CoefficientSchedule, LatentAlarm, ModelCard, OfflineTrainer
 
-
 SIGREG_FALL = 0.8  # share of training after which lambda has its last value
 
 

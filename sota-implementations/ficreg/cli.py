@@ -79,7 +79,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
     chosen = [o.input_line for o in overrides if o.key_or_group in groups and not o.is_sweep_override()]
     for override in overrides:
         if override.key_or_group in groups and not override.is_sweep_override():
-            options = sorted(path.stem for path in (CONFIG_DIR / override.key_or_group).glob("*.yaml"))
+            options = sorted(path.stem for path in (CONFIG_DIR / override.key_or_group).glob("[!_]*.yaml"))
             if override.value() not in options:
                 raise ValueError(f"{override.key_or_group}={override.value()} is unknown: choose one of {options}.")
     with initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):

@@ -7,7 +7,8 @@ from pathlib import Path
 from cli import entry_point
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from utils import evaluate_beside_random, get_device, make_policy, report, versions, write_json
+from planning import check_horizon, make_policy, plan_config
+from utils import evaluate_beside_random, get_device, report, versions, write_json
 
 from torchrl_ficreg.evaluation import save_episodes_gif, StartGoalPairs
 from torchrl_ficreg.trainers import find_checkpoint, load_world_model, ModelCard
@@ -29,17 +30,22 @@ def main(cfg: DictConfig) -> None:
     if not manifest.exists():
         raise FileNotFoundError(f"no start-goal pairs at {manifest}: let train.py finish, or give pairs=...")
     pairs = StartGoalPairs.load(manifest)
-    model, _, card = load_world_model(checkpoint)
+    model, inverse_model, card = load_world_model(checkpoint)
     if pairs.env != card.env:
         raise ValueError(f"the model was trained on {card.env}, the pairs belong to {pairs.env}: give others, pairs=...")
     plan = plan_of_run(cfg, card)
-    policy = make_policy(plan, model.to(get_device(cfg.device)), card.action_low, card.action_high)
+    budget = cfg.budget or card.config["env"]["budget"]
+    plan_config(plan)
+    check_horizon(plan, model.frame_skip, budget)
+    device = get_device(cfg.device)
+    bounds = (card.action_low, card.action_high)
+    policy = make_policy(plan, model.to(device), inverse_model.to(device), bounds, run_dir)
     method = card.config["method"]["name"]
     outcome, floor = evaluate_beside_random(
         policy,
         pairs,
         card,
-        budget=cfg.budget or card.config["env"]["budget"],
+        budget=budget,
         num_envs=cfg.num_envs,
         num_workers=cfg.num_workers,
         record=cfg.record,

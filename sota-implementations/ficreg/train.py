@@ -15,23 +15,25 @@ import torch
 from cli import entry_point
 from episodes import find_dataset, make_dataset
 from omegaconf import DictConfig
+from planning import make_policy
 from run_dir import check_run_dir, claim_run_dir
 from utils import (
     add_hooks,
     check_settings,
+    encoder_of,
     evaluate_beside_random,
     get_device,
     make_card,
     make_logger,
     make_loss,
-    make_policy,
     model_config,
     report,
     versions,
     write_json,
 )
 
-from torchrl_ficreg import LatentWorldModel, make_world_model
+from torchrl_ficreg import InverseDynamicsModel, LatentWorldModel, make_world_model
+from torchrl_ficreg.data.latents import encode_episodes, LatentClips
 from torchrl_ficreg.evaluation import (
     latent_distance,
     plot_latent_distance,
@@ -39,7 +41,14 @@ from torchrl_ficreg.evaluation import (
     save_episodes_gif,
     StartGoalPairs,
 )
-from torchrl_ficreg.trainers import checkpoint_components, ModelCard, OfflineTrainer
+from torchrl_ficreg.trainers import (
+    checkpoint_components,
+    ModelCard,
+    NoRegularizer,
+    OfflineTrainer,
+    on_frozen_latents,
+    Refinement,
+)
 from torchrl_ficreg.trainers.offline import METRICS
 
 
@@ -51,14 +60,17 @@ def main(cfg: DictConfig) -> None:
     data = find_dataset(cfg)
     pairs = draw_pairs(cfg, data)  # before training: too few episodes shall not come to light after it
     run_dir = claim_run_dir(cfg)
-    model, card, training = train(cfg, data, run_dir)
-    results = {**evaluate(cfg, data, run_dir, model, card, pairs), "training": training, "versions": versions()}
+    model, inverse_model, card, training = train(cfg, data, run_dir)
+    outcome = evaluate(cfg, data, run_dir, model, inverse_model, card, pairs)
+    results = {**outcome, "training": training, "versions": versions()}
     write_json(run_dir / "results.json", results)
     report(results, (cfg.method.name, "random"), run_dir)
 
 
-def train(cfg: DictConfig, data: Path, run_dir: Path) -> tuple[LatentWorldModel, ModelCard, dict]:
-    """Trains, or continues, and returns the model in eval mode."""
+def train(
+    cfg: DictConfig, data: Path, run_dir: Path
+) -> tuple[LatentWorldModel, InverseDynamicsModel, ModelCard, dict]:
+    """Trains, or continues, and returns the networks in eval mode."""
     torch.manual_seed(cfg.seed)
     clips = make_dataset(cfg, data, "train", prefetch=1)
     held_out = make_dataset(cfg, data, "validation", drop_last=False)
@@ -67,12 +79,13 @@ def train(cfg: DictConfig, data: Path, run_dir: Path) -> tuple[LatentWorldModel,
     model.statistics = clips.statistics
     device = get_device(cfg.device)
     loss = make_loss(cfg, model.to(device), inverse_model.to(device))
+    refinement = Refinement(seed=cfg.seed, precision=cfg.optim.precision, **cfg.refine)
     trainer = OfflineTrainer(
         loss,
         clips,
         run_dir=run_dir,
         validation_buffer=held_out,
-        components=checkpoint_components(model, inverse_model, card),
+        components={**checkpoint_components(model, inverse_model, card), "refinement": refinement},
         log_interval=cfg.logger.interval,
         logger=make_logger(cfg, run_dir),
         **{key: value for key, value in cfg.optim.items() if key != "batch_size"},
@@ -82,15 +95,30 @@ def train(cfg: DictConfig, data: Path, run_dir: Path) -> tuple[LatentWorldModel,
     if 0 < resumed_at < trainer.total_steps:
         print(f"continuing {run_dir} after step {resumed_at} of {trainer.total_steps}")
     trainer.train()
+    if not refinement.done:
+        refine(cfg, data, model, inverse_model, refinement)
+        trainer.save_trainer(force_save=True)
     training = {
         "steps": trainer.step,
         "clips": clips.num_clips,
         "resumed_at_step": resumed_at,
         "seconds": trainer.clock.seconds,
+        "refinement_steps": refinement.steps,
+        "refinement_seconds": refinement.seconds,
         "parameters": sum(p.numel() for p in model.parameters()),
         "dataset_fingerprint": clips.fingerprint,
     }
-    return model.eval(), card, training
+    return model.eval(), inverse_model.eval(), card, training
+
+
+def refine(
+    cfg: DictConfig, data: Path, model: LatentWorldModel, inverse_model: InverseDynamicsModel, refinement: Refinement
+) -> None:
+    """Trains predictor and inverse model further, on latents of the frozen encoder."""
+    clips = make_dataset(cfg, data, "train", statistics=model.statistics)
+    latent = encode_episodes(clips, encoder_of(model.eval(), cfg.optim.precision), description="encode")
+    loss = make_loss(cfg, on_frozen_latents(model), inverse_model, sigreg=NoRegularizer())
+    refinement.run(loss, LatentClips(clips, latent))
 
 
 def draw_pairs(cfg: DictConfig, data: Path) -> StartGoalPairs:
@@ -102,13 +130,19 @@ def draw_pairs(cfg: DictConfig, data: Path) -> StartGoalPairs:
 
 
 def evaluate(
-    cfg: DictConfig, data: Path, run_dir: Path, model: LatentWorldModel, card: ModelCard, pairs: StartGoalPairs
+    cfg: DictConfig,
+    data: Path,
+    run_dir: Path,
+    model: LatentWorldModel,
+    inverse_model: InverseDynamicsModel,
+    card: ModelCard,
+    pairs: StartGoalPairs,
 ) -> dict:
     """Plans on the frozen pairs, looks at the latent space, draws the pictures."""
     held_out = make_dataset(cfg, data, "evaluation", drop_last=False)
     settings = cfg.evaluation
     pairs.save(run_dir / "pairs.json")
-    policy = make_policy(cfg.plan, model, card.action_low, card.action_high)
+    policy = make_policy(cfg.plan, model, inverse_model, (card.action_low, card.action_high), run_dir)
     outcome, floor = evaluate_beside_random(
         policy,
         pairs,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -14,18 +15,18 @@ import torch
 import torchrl
 from episodes import describe_env
 from omegaconf import DictConfig, OmegaConf
+from planning import check_horizon, plan_config
+from torch import nn
 from torchrl.record.loggers import get_logger, Logger
 
 from torchrl_ficreg import (
     FICRegLoss,
     JointInverseLoss,
-    LatentCEMPlanner,
     LatentWorldModel,
     LeWMLoss,
     make_world_model,
     ModelConfig,
     MPCPolicy,
-    PlanConfig,
     PLDMLoss,
     SIGReg,
 )
@@ -33,8 +34,8 @@ from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.data.frames import check_frame_format
 from torchrl_ficreg.evaluation import Evaluation, evaluate_mpc, StartGoalPairs, UniformPolicy
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
-from torchrl_ficreg.modules.precision import uses_bf16
-from torchrl_ficreg.trainers import CoefficientSchedule, LatentAlarm, ModelCard, OfflineTrainer
+from torchrl_ficreg.modules.precision import autocast, Precision, uses_bf16
+from torchrl_ficreg.trainers import CoefficientSchedule, LatentAlarm, ModelCard, OfflineTrainer, Refinement
 
 SIGREG_FALL = 0.8  # share of training after which lambda has its last value
 
@@ -60,12 +61,14 @@ def model_config(cfg: DictConfig) -> ModelConfig:
     return ModelConfig(**{name: value for name, value in values.items() if name in names})
 
 
-def make_loss(cfg: DictConfig, model: LatentWorldModel, inverse_model: InverseDynamicsModel) -> LeWMLoss:
-    """The loss of a configuration's ``method``."""
+def make_loss(
+    cfg: DictConfig, model: LatentWorldModel, inverse_model: InverseDynamicsModel, sigreg: nn.Module | None = None
+) -> LeWMLoss:
+    """The loss of a configuration's ``method``, with SIGReg unless told otherwise."""
     networks = (model.encoder, model.predictor, inverse_model)
     weights = {key: value for key, value in cfg.loss.items() if key != "sigreg_start"}
     settings = {key: value for key, value in cfg.method.items() if key not in ("name", "consistency_warmup")}
-    sigreg = SIGReg(seed=cfg.seed).to(next(model.parameters()).device)
+    sigreg = SIGReg(seed=cfg.seed).to(next(model.parameters()).device) if sigreg is None else sigreg
     if cfg.method.name == "lewm":
         return LeWMLoss(*networks[:2], sigreg=sigreg, sigreg_coeff=cfg.loss.sigreg_coeff)
     if cfg.method.name == "joint_inverse":
@@ -75,6 +78,17 @@ def make_loss(cfg: DictConfig, model: LatentWorldModel, inverse_model: InverseDy
     if cfg.method.name == "pldm":
         return PLDMLoss(*networks, **settings)
     return FICRegLoss(*networks, sigreg=sigreg, **settings, **weights)
+
+
+def encoder_of(model: LatentWorldModel, precision: Precision) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Frames [n, 3, H, W] -> latents [n, D], on the model's device."""
+    device = model.action_mean.device
+
+    def encode(pixels: torch.Tensor) -> torch.Tensor:
+        with autocast(device, precision):
+            return model.encode(pixels.to(device))
+
+    return encode
 
 
 def add_hooks(cfg: DictConfig, trainer: OfflineTrainer) -> None:
@@ -127,20 +141,6 @@ def make_card(cfg: DictConfig, dataset: OfflineTrajectories) -> ModelCard:
     )
 
 
-def plan_config(plan: DictConfig) -> PlanConfig:
-    """The settings in a configuration's ``plan`` group."""
-    values = OmegaConf.to_container(plan)
-    search = values.pop("search")
-    if search != "cem":
-        raise ValueError(f"unknown plan.search {search!r}: choose cem.")
-    return PlanConfig(**values)
-
-
-def make_policy(plan: DictConfig, model: LatentWorldModel, low: list[float], high: list[float]) -> MPCPolicy:
-    """The planner of a configuration's ``plan`` group, serving one action per environment step."""
-    return MPCPolicy(LatentCEMPlanner(model, plan_config(plan), action_bounds=(low, high)))
-
-
 def evaluate_beside_random(
     policy: MPCPolicy, pairs: StartGoalPairs, card: ModelCard, *, record: int, num_workers: int, **settings: Any
 ) -> tuple[Evaluation, Evaluation]:
@@ -159,7 +159,9 @@ def check_settings(cfg: DictConfig) -> None:
         ValueError: a setting outside its range, or an unknown choice.
     """
     plan_config(cfg.plan)
+    check_horizon(cfg.plan, cfg.model.frame_skip, cfg.env.budget)
     get_device(cfg.device)
+    Refinement(**cfg.refine)
     if not cfg.name or Path(cfg.name).name != cfg.name or cfg.name.startswith("."):
         raise ValueError(f"name={cfg.name!r} must be the plain name of a folder; runs_dir says where that folder goes.")
     if cfg.logger.backend not in ("csv", "wandb", "tensorboard"):

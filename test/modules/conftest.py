@@ -38,14 +38,8 @@ class LinearDynamics(nn.Module):
         self.history, self.latent_dim, self.action_dim = 1, dim, frame_skip * dim
         self.position = nn.Parameter(torch.eye(dim).repeat(frame_skip, 1))  # [F * A, D]
 
-    def modulation(self, action):
-        return (action @ self.position).unsqueeze(0)
-
-    def step(self, latent, modulation):
-        return latent + modulation[0]
-
     def forward(self, latent, action):
-        return self.step(latent, self.modulation(action))
+        return latent + action @ self.position
 
 
 class Corner(nn.Module):

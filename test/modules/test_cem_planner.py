@@ -185,7 +185,7 @@ def test_statistics_that_cannot_come_from_the_bounds_are_refused(linear_world, m
 def test_inputs_of_other_shapes_are_refused(linear_world, shapes):
     latent, goal, seeds = shapes
     planner = LatentCEMPlanner(linear_world(), PlanConfig(**FAST), action_bounds=UNIT)
-    with pytest.raises(ValueError, match=r"expected latents \[E, D\], goals \[E, D\] and seeds \[E\]"):
+    with pytest.raises(ValueError, match=r"expected latents \[E, 2\] or \[E, C, 2\], goals \[E, 2\]|past_action"):
         planner.plan(torch.zeros(latent), torch.zeros(goal), torch.arange(seeds))
 
 

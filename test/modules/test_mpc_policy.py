@@ -20,9 +20,10 @@ class Counted(LatentPlanner):
 
     asked: list[float]
 
-    def _search(self, latent, goal, seeds):
+    def _search(self, problem):
+        latent = problem.latent  # [e, 1, D]
         self.__dict__.setdefault("asked", []).extend(latent[:, 0, 0].tolist())
-        block = self.world_model.predictor.module.action_dim
+        block = self.world_model.block_dim
         plan = torch.arange(self.config.horizon * block).view(1, self.config.horizon, block) * 0.001 + latent[:, :, :1]
         return TensorDict({"plan": plan, "plan_cost": latent[:, 0, 0]}, [len(latent)])
 

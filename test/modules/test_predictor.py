@@ -54,13 +54,22 @@ def test_leading_dimensions_are_rows(predictor, lead, tokens):
     torch.testing.assert_close(result, flat.reshape(latent.shape))
 
 
-def test_a_modulation_computed_ahead_gives_the_same_prediction(predictor):
-    """A planner computes it for the whole sequence and cuts windows out."""
-    latent, action = torch.randn(2, 2, 6), torch.randn(2, 5, 4)
-    network = predictor.module
-    ahead = network.modulation(action)
-    assert ahead.shape == (2, 2, 5, 48)
-    torch.testing.assert_close(network.step(latent, ahead[:, :, 3:5]), network(latent, action[:, 3:5]))
+@pytest.mark.parametrize("context", [1, 2, 3, 4])
+def test_imagining_computes_each_token_of_a_growing_window_once(predictor, context):
+    """Six blocks from C frames on: one token a step until the window of three slides, then all three."""
+    tokens = []
+    hook = predictor.module.blocks[0].mlp.register_forward_pre_hook(lambda _, x: tokens.append(x[0].shape[1]))
+    imagined = predictor.module.imagine(torch.randn(2, context, 6), torch.randn(2, context + 5, 4))
+    hook.remove()
+    assert imagined.shape == (2, 6, 6)
+    assert tokens == {1: [1, 1, 1, 3, 3, 3], 2: [2, 1, 3, 3, 3, 3], 3: [3] * 6, 4: [3] * 6}[context]
+
+
+def test_the_last_layer_computes_the_last_token_alone(predictor):
+    tokens = []
+    predictor.module.blocks[-1].mlp.register_forward_pre_hook(lambda _, x: tokens.append(x[0].shape[1]))
+    predictor.module.imagine(torch.randn(2, 1, 6), torch.randn(2, 6, 4))
+    assert tokens == [1] * 6
 
 
 def test_a_wider_latent_needs_no_adapter_and_another_gets_one():

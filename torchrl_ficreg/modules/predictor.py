@@ -9,7 +9,7 @@ from torch import nn
 
 from torchrl_ficreg.data.schema import ACTION, LATENT, PREDICTED_LATENT
 from torchrl_ficreg.modules.projector import Projector
-from torchrl_ficreg.modules.transformer import AdaptiveBlock
+from torchrl_ficreg.modules.transformer import AdaptiveBlock, Cache
 
 
 class ActionEmbedding(nn.Module):
@@ -107,20 +107,58 @@ class CausalTransformer(nn.Module):
         """Draws the position embedding; the layers reset themselves."""
         nn.init.normal_(self.position, std=0.02)
 
-    def modulation(self, action: torch.Tensor) -> torch.Tensor:
-        """Action blocks [..., T, F * A] -> modulation of every layer [depth, ..., T, 6 * width].
+    def modulation(self, action: torch.Tensor) -> list[torch.Tensor]:
+        """Action blocks [..., T, F * A] -> modulation of each layer [..., T, 6 * width].
 
-        It depends on the actions alone, so a planner computes it once and slides its window over the result.
+        It depends on the actions alone, so a rollout computes it once and slides its window over the result.
         """
         condition = self.action_embedding(action)  # [..., T, width]
-        return torch.stack([block.modulation(condition) for block in self.blocks])
+        return [block.modulation(condition) for block in self.blocks]
 
-    def step(self, latent: torch.Tensor, modulation: torch.Tensor) -> torch.Tensor:
-        """Latents [N, T, D] and modulation [depth, N, T, 6 * width] -> next latents [N, T, D], T at most H."""
-        tokens = self.to_width(latent) + self.position[:, : latent.shape[-2]]  # [N, T, width]
-        for block, block_modulation in zip(self.blocks, modulation):
-            tokens = block(tokens, block_modulation)
-        return self.projector(self.norm(tokens))
+    def imagine(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Feeds predictions back: what :meth:`forward` gives on each window, with no token computed in vain.
+
+        While the window grows, the keys and values of its tokens stay as they are and one token is computed per step.
+        Once it slides, every position changes, and with it every token; the last layer still needs the last one alone.
+        For eval mode: dropout is not applied.
+
+        Args:
+            latent: context [N, C, D], oldest first.
+            action: blocks [N, C - 1 + S, F * A]: those between the context frames, then those to be imagined.
+
+        Returns:
+            [N, S, D].
+        """
+        context = latent.shape[-2]
+        if self.history == 1:
+            steps = [latent[:, -1:]]  # [N, 1, D] each
+            for block in action[:, context - 1 :].split(1, dim=-2):
+                steps.append(self(steps[-1], block))
+            return torch.cat(steps[1:], dim=-2)
+        modulation = self.modulation(action)
+        window = list(latent.unbind(-2))  # C + S latents in the end, each [N, D]
+        seen, first = None, max(0, context - self.history)  # oldest token of the window
+        for end in range(context, action.shape[-2] + 1):
+            if end - first > self.history:
+                seen, first = None, end - self.history
+            known = 0 if seen is None else seen[0][0].shape[-2]  # tokens of the window computed before
+            new = torch.stack(window[first + known : end], dim=-2)  # [N, T, D]
+            ahead = [layer[:, first + known : end] for layer in modulation]
+            predicted, seen = self._extend(new, ahead, seen, known)
+            window.append(predicted)
+        return torch.stack(window[context:], dim=-2)
+
+    def _extend(
+        self, latent: torch.Tensor, modulation: list[torch.Tensor], past: list[Cache] | None, position: int
+    ) -> tuple[torch.Tensor, list[Cache]]:
+        """New latents [N, T, D] from a position on, and what is kept of those before -> the next latent [N, D]."""
+        tokens = self.to_width(latent) + self.position[:, position : position + latent.shape[-2]]  # [N, T, width]
+        seen = []
+        for depth, (block, ahead) in enumerate(zip(self.blocks, modulation)):
+            last = depth == len(self.blocks) - 1
+            tokens, cache = block.extend(tokens, ahead, past[depth] if past else None, last)
+            seen.append(cache)
+        return self.projector(self.norm(tokens))[:, -1], seen
 
     def forward(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Latents [..., T, D] and the action blocks that lead on from them [..., T, F * A] -> [..., T, D].
@@ -137,7 +175,10 @@ class CausalTransformer(nn.Module):
         if latent.shape[-1] != self.latent_dim:
             raise ValueError(f"latents must be {self.latent_dim} wide, got {latent.shape[-1]}.")
         latent, action = latent.reshape(-1, *latent.shape[-2:]), action.reshape(-1, *action.shape[-2:])
-        return self.step(latent, self.modulation(action)).reshape(*lead, tokens, -1)
+        x = self.to_width(latent) + self.position[:, :tokens]  # [N, T, width]
+        for block, modulation in zip(self.blocks, self.modulation(action)):
+            x = block(x, modulation)
+        return self.projector(self.norm(x)).reshape(*lead, tokens, -1)
 
 
 class CausalPredictor(TensorDictModule):

@@ -10,28 +10,51 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+Cache = tuple[torch.Tensor, torch.Tensor]  # keys and values, each [N, heads, T, dim_head]
+
+
+FEW = 4  # tokens up to which attention costs less by elementwise products than by matrix products, on CPUs
+
 
 def attend(query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: bool) -> torch.Tensor:
     """Softmax attention by the kernel that is fastest on the device at hand.
 
     The fused kernel wins on CUDA. On CPUs its backward pass costs twice that of two plain matrix products around
-    a softmax, and on windows of a few tokens its forward does too, so plain products are used there.
+    a softmax, so these are used there in training; the windows of a few tokens that a planner imagines by the thousand
+    are cheaper still without any matrix product.
 
     Args:
-        query, key, value: [N, heads, T, dim_head], any floating dtype.
-        causal: a token sees itself and earlier ones only.
+        query: [N, heads, Q, dim_head], any floating dtype.
+        key, value: [N, heads, T, dim_head].
+        causal: a token sees itself and earlier ones only; Q = T then.
 
     Returns:
-        [N, heads, T, dim_head].
+        [N, heads, Q, dim_head].
     """
     if query.device.type != "cpu":
         return F.scaled_dot_product_attention(query, key, value, is_causal=causal)
-    scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)  # [N, heads, T, T]
+    if key.shape[-2] <= FEW and not (torch.is_grad_enabled() and query.requires_grad):
+        return _attend_to_few(query, key, value, causal)
+    scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)  # [N, heads, Q, T]
     if causal:
         tokens = scores.shape[-1]
         future = torch.ones(tokens, tokens, dtype=torch.bool, device=scores.device).triu(1)  # [T, T]
         scores = scores.masked_fill(future, -torch.inf)
     return scores.softmax(-1).to(value.dtype) @ value
+
+
+def _attend_to_few(query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: bool) -> torch.Tensor:
+    """As :func:`attend`, token by token: matrix products of a few rows spend their time on copies."""
+    keys, values, mixed = key.unbind(2), value.unbind(2), []  # each [N, heads, dim_head]
+    for place, token in enumerate((query * query.shape[-1] ** -0.5).unbind(2)):
+        seen = place + 1 if causal else len(keys)
+        scores = torch.stack([(token * keys[i]).sum(-1, keepdim=True) for i in range(seen)])  # [seen, N, heads, 1]
+        weights = scores.softmax(0)
+        mix = weights[0] * values[0]
+        for i in range(1, seen):
+            mix = torch.addcmul(mix, weights[i], values[i])
+        mixed.append(mix)
+    return torch.stack(mixed, dim=1).transpose(1, 2)  # in memory [N, Q, heads, dim_head], as the next layer reads it
 
 
 class Attention(nn.Module):
@@ -62,9 +85,39 @@ class Attention(nn.Module):
             bias = self.to_qkv.bias[2 * self.inner :] if self.to_qkv.bias is not None else None
             mixed = F.linear(x, self.to_qkv.weight[2 * self.inner :], bias)  # [N, 1, inner]
         else:
-            query, key, value = self.to_qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
+            query, key, value = self._heads(self.to_qkv(x), 3).unbind(0)
             mixed = attend(query, key, value, self.causal).transpose(1, 2).flatten(2)  # [N, T, inner]
         return self.dropout(self.to_out(mixed))
+
+    def extend(self, x: torch.Tensor, past: Cache | None, last: bool) -> tuple[torch.Tensor, Cache]:
+        """Causal attention of new tokens whose predecessors' keys and values are known; no dropout.
+
+        Args:
+            x: [N, T, C]; T = 1 if there is a past.
+            past: keys and values of the P earlier tokens, each [N, heads, P, dim_head].
+            last: return the last token alone, at the cost of one token.
+
+        Returns:
+            [N, T, C], or [N, 1, C] if ``last``, and the keys and values of all P + T tokens.
+        """
+        if last and x.shape[-2] > 1:
+            weight, bias = self.to_qkv.weight, self.to_qkv.bias
+            split = (None, None) if bias is None else (bias[: self.inner], bias[self.inner :])
+            newest = x[:, -1].contiguous()  # [N, C]; of a strided 3-D input, torch multiplies row by row
+            query = self._heads(F.linear(newest, weight[: self.inner], split[0]).unsqueeze(1), 1)
+            key, value = self._heads(F.linear(x, weight[self.inner :], split[1]), 2).unbind(0)
+            query = query[0]
+        else:
+            query, key, value = self._heads(self.to_qkv(x), 3).unbind(0)
+        if past is not None:
+            key, value = torch.cat([past[0], key], dim=-2), torch.cat([past[1], value], dim=-2)
+        causal = query.shape[-2] > 1
+        mixed = attend(query, key, value, causal).transpose(1, 2).flatten(2)  # [N, Q, inner]
+        return self.to_out(mixed), (key, value)
+
+    def _heads(self, x: torch.Tensor, parts: int) -> torch.Tensor:
+        """[N, T, parts * inner] -> [parts, N, heads, T, dim_head]."""
+        return x.unflatten(-1, (parts, self.heads, -1)).permute(2, 0, 3, 1, 4)
 
 
 class FeedForward(nn.Sequential):
@@ -123,3 +176,14 @@ class AdaptiveBlock(nn.Module):
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.chunk(6, dim=-1)  # each [N, T, C]
         x = x + gate_a * self.attn(self.attn_norm(self.adaptive_norm(x) * (1 + scale_a) + shift_a))
         return x + gate_m * self.mlp(self.mlp_norm(self.adaptive_norm(x) * (1 + scale_m) + shift_m))
+
+    def extend(
+        self, x: torch.Tensor, modulation: torch.Tensor, past: Cache | None, last: bool
+    ) -> tuple[torch.Tensor, Cache]:
+        """As :meth:`forward` without dropout, for new tokens after known ones; see :meth:`Attention.extend`."""
+        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.chunk(6, dim=-1)  # each [N, T, C]
+        mixed, seen = self.attn.extend(self.attn_norm(self.adaptive_norm(x) * (1 + scale_a) + shift_a), past, last)
+        if last:
+            x, gate_a, shift_m, scale_m, gate_m = (t[:, -1:].contiguous() for t in (x, gate_a, shift_m, scale_m, gate_m))
+        x = x + gate_a * mixed
+        return x + gate_m * self.mlp(self.mlp_norm(self.adaptive_norm(x) * (1 + scale_m) + shift_m)), seen

@@ -58,6 +58,16 @@ class LatentWorldModel(TensorDictModuleBase):
         return self.predictor.history
 
     @property
+    def latent_dim(self) -> int:
+        """D, the width of a latent."""
+        return self.predictor.module.latent_dim
+
+    @property
+    def block_dim(self) -> int:
+        """F * A, the width of an action block."""
+        return self.frame_skip * len(self.action_mean)
+
+    @property
     def statistics(self) -> ActionStatistics:
         """Mean and std [A] of raw actions in the training episodes."""
         return ActionStatistics(self.action_mean, self.action_std)
@@ -97,26 +107,29 @@ class LatentWorldModel(TensorDictModuleBase):
         Raises:
             ValueError: no block to imagine, leading dimensions that differ, or a wrong width.
         """
-        network = self.predictor.module
         if not (
             min(latent.ndim, action.ndim) >= 2
             and latent.shape[:-2] == action.shape[:-2]
             and 1 <= latent.shape[-2] <= action.shape[-2]
-            and latent.shape[-1] == network.latent_dim
+            and latent.shape[-1] == self.latent_dim
         ):
             raise ValueError(
-                f"rollout takes latents [..., C, {network.latent_dim}] and C - 1 + N action blocks "
+                f"rollout takes latents [..., C, {self.latent_dim}] and C - 1 + N action blocks "
                 f"[..., C - 1 + N, F * A], N >= 1, got {list(latent.shape)} and {list(action.shape)}."
             )
-        lead, context, blocks = latent.shape[:-2], latent.shape[-2], action.shape[-2]
-        steps = blocks - context + 1
-        window = list(latent.reshape(-1, context, latent.shape[-1]).unbind(1))  # C x [N, D]
-        modulation = network.modulation(action.reshape(-1, blocks, action.shape[-1]))  # [depth, N, blocks, 6 * width]
-        for end in range(context, context + steps):
+        lead = latent.shape[:-2]
+        rows, blocks = latent.reshape(-1, *latent.shape[-2:]), action.reshape(-1, *action.shape[-2:])
+        imagine = getattr(self.predictor.module, "imagine", self._imagine)
+        return imagine(rows, blocks).reshape(*lead, -1, self.latent_dim)
+
+    def _imagine(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """As :meth:`CausalTransformer.imagine`, for any network: [N, C, D] and [N, C - 1 + S, F * A] -> [N, S, D]."""
+        context = latent.shape[-2]
+        for end in range(context, action.shape[-2] + 1):
             start = max(0, end - self.history)
-            seen = torch.stack(window[start:end], dim=1)  # [N, T, D], T <= H
-            window.append(network.step(seen, modulation[:, :, start:end])[:, -1])
-        return torch.stack(window[context:], dim=1).reshape(*lead, steps, -1)
+            predicted = self.predict(latent[:, start:end], action[:, start:end])[:, -1:]  # [N, 1, D]
+            latent = torch.cat([latent, predicted], dim=-2)
+        return latent[:, context:]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Encodes a clip and predicts every frame but its first from those before it.

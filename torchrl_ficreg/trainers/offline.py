@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import time
 from pathlib import Path
@@ -20,6 +19,7 @@ from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.modules.precision import Precision
 from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, DAMAGES
 from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
+from torchrl_ficreg.trainers.schedule import WarmupCosine
 from torchrl_ficreg.trainers.stepper import OfflineStepper
 from torchrl_ficreg.trainers.stream import ReplayStream
 
@@ -239,26 +239,3 @@ class Clock:
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
         """Continues from there."""
         self._before = float(state_dict["seconds"])
-
-
-class WarmupCosine:
-    """Factor of the learning rate: linear from 0 over the warm-up, then a cosine to 0 at the last step.
-
-    Args:
-        steps: of the whole run.
-        warmup: share of them in which the factor rises.
-
-    Examples:
-        >>> factor = WarmupCosine(steps=100, warmup=0.1)
-        >>> factor(0), factor(9), round(factor(100), 6)
-        (0.1, 1.0, 0.0)
-    """
-
-    def __init__(self, steps: int, warmup: float) -> None:
-        self.steps, self.rise = steps, max(1, round(warmup * steps))
-
-    def __call__(self, step: int) -> float:
-        """Factor of the update after ``step`` updates."""
-        if step < self.rise:
-            return (step + 1) / self.rise
-        return 0.5 * (1 + math.cos(math.pi * (step - self.rise) / max(1, self.steps - self.rise)))

@@ -1,14 +1,11 @@
-"""What every latent planner shares: its settings, its bounds, its random draws and its place in TorchRL."""
+"""What every latent planner shares: its bounds, its costs, its random draws and its place in TorchRL."""
 
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Literal
+import functools
+from collections.abc import Sequence
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
@@ -16,71 +13,45 @@ from torchrl.modules import SafeModule
 from torchrl.modules.planners import MPCPlannerBase
 
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
-from torchrl_ficreg.modules.planners.costs import GoalDistance
-from torchrl_ficreg.modules.precision import Precision, uses_bf16
+from torchrl_ficreg.modules.goal_policy import GoalPolicy
+from torchrl_ficreg.modules.planners.config import PlanConfig
+from torchrl_ficreg.modules.planners.costs import Cost, GoalDistance, wanted_by
+from torchrl_ficreg.modules.planners.dynamics import FastDynamics
+from torchrl_ficreg.modules.planners.problem import make_generator, Problem
+from torchrl_ficreg.modules.precision import autocast, uses_bf16
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
-PLAN, PLAN_COST, PLAN_SEED = "plan", "plan_cost", "plan_seed"
-
-
-@dataclass(frozen=True)
-class PlanConfig:
-    """Settings of a search. The defaults are the published evaluation of PushT (arXiv 2603.19312).
-
-    Raises:
-        ValueError: a number outside its range.
-    """
-
-    num_candidates: int = 300  # K, action sequences tried in one iteration
-    num_elites: int = 30  # best candidates that the next iteration is fitted to, at least 2
-    iterations: int = 30
-    horizon: int = 5  # action blocks imagined
-    receding_horizon: int = 5  # action blocks executed before planning again, at most horizon
-    std: float = 1.0  # of the first iteration, in z-scored actions
-    bounds: Literal["environment", "none"] = "environment"  # "none" is the published evaluation
-    precision: Precision = "auto"  # of the imagined rollouts: "auto", "fp32" or "bf16"
-    seed: int = 0  # of the random draws
-
-    def __post_init__(self) -> None:
-        if not 2 <= self.num_elites <= self.num_candidates:
-            raise ValueError(
-                f"num_elites must lie between 2 and num_candidates={self.num_candidates}, got {self.num_elites}."
-            )
-        if self.iterations < 1 or self.horizon < 1 or not 1 <= self.receding_horizon <= self.horizon:
-            raise ValueError(
-                "iterations, horizon and receding_horizon must be positive and receding_horizon at most horizon, "
-                f"got {self.iterations}, {self.horizon} and {self.receding_horizon}."
-            )
-        if not self.std > 0:
-            raise ValueError(f"std must be positive, got {self.std}.")
-        if self.bounds not in ("environment", "none"):
-            raise ValueError(f"unknown bounds {self.bounds!r}: choose 'environment' or 'none'.")
-        if self.seed < 0:
-            raise ValueError(f"seed must not be negative, got {self.seed}.")
-        uses_bf16("cpu", self.precision)  # refuses an unknown one
+PLAN, PLAN_COST, PLAN_SEED, PAST_ACTION, TRACE = "plan", "plan_cost", "plan_seed", "past_action", "trace"
 
 
 class LatentPlanner(MPCPlannerBase):
     """Dynamics x cost x search: plans in latent space and never sees an environment.
 
     Reads ``latent`` [E, D] and ``goal_latent`` [E, D]; ``plan_seed`` [E] int64 names the random draws of each
-    environment and defaults to 0, 1, ... Writes ``plan`` [E, horizon, F * A] z-scored, its predicted ``plan_cost`` [E]
-    and, as TorchRL's planners do, the first block as ``action`` [E, F * A].
+    environment and defaults to 0, 1, ... A predictor that sees several frames makes use of a context: ``latent``
+    [E, C, D] with ``past_action`` [E, C - 1, F * A], the blocks executed between these frames. Writes ``plan``
+    [E, horizon, F * A] z-scored, its predicted ``plan_cost`` [E] and, as TorchRL's planners do, the first block as
+    ``action`` [E, F * A]; with ``config.trace`` also the ``trace`` of every iteration.
 
-    Every environment draws from a generator of its own, on the CPU. On CPUs the search runs environment by environment
-    as well (300 candidates fill the cores), so there a plan is the same to the last bit alone or among fifty;
-    elsewhere the same up to the float kernels.
+    Every environment draws from a generator of its own. On CPUs the search runs environment by environment as well
+    (300 candidates fill the cores), so there a plan is the same to the last bit alone or among fifty; elsewhere the
+    same up to the float kernels.
 
     Args:
         world_model: the dynamics; put it into ``eval()`` first.
-        config: settings; :class:`PlanConfig`.
+        config: settings, of the kind in ``config_class``.
         action_bounds: (low [A], high [A]) in environment units; needed unless ``config.bounds`` is ``"none"``.
-        cost: module from predictions [E, K, T, D] and goals [E, D] to costs [E, K];
-            :class:`~torchrl_ficreg.modules.planners.costs.GoalDistance` when None.
+        cost: module from predictions [E, K, T, D] and goals [E, D] to costs [E, K], see
+            :mod:`torchrl_ficreg.modules.planners.costs`; :class:`~torchrl_ficreg.GoalDistance` when None.
+        policy: proposes ``config.num_proposals`` of the first candidates.
 
     Raises:
-        ValueError: bounds are missing or have another shape than the model's actions.
+        ValueError: bounds are missing or have another shape than the model's actions, or the policy does not fit.
+        TypeError: settings of another search.
     """
+
+    config_class: type[PlanConfig] = PlanConfig
+    needs_gradient = False  # of the cost with respect to the candidates
 
     def __init__(
         self,
@@ -88,14 +59,26 @@ class LatentPlanner(MPCPlannerBase):
         config: PlanConfig | None = None,
         *,
         action_bounds: tuple[Sequence[float], Sequence[float]] | None = None,
-        cost: nn.Module | None = None,
+        cost: Cost | None = None,
+        policy: GoalPolicy | None = None,
     ) -> None:
         # MPCPlannerBase.__init__ wants an environment to imagine in; the world model takes its place.
         SafeModule.__init__(self, world_model, in_keys=[LATENT, GOAL_LATENT], out_keys=[ACTION])
         self.world_model = world_model
-        self.config = PlanConfig() if config is None else config
+        self.config = self.config_class() if config is None else config
+        if not isinstance(self.config, self.config_class):
+            raise TypeError(
+                f"{type(self).__name__} takes a {self.config_class.__name__}, got a {type(self.config).__name__}."
+            )
         self.cost = GoalDistance() if cost is None else cost
+        self.policy = policy
+        if policy is not None:
+            policy.check_fits(world_model)
         self.action_bounds = self._check_bounds(action_bounds)
+        self._wanted = wanted_by(self.cost)
+        self._fast = FastDynamics()
+        mode = {"mode": "reduce-overhead"} if torch.cuda.is_available() else {}
+        self._rollout_cost = torch.compile(self._imagined_cost, **mode) if self.config.compile else self._imagined_cost
 
     def _check_bounds(self, bounds) -> tuple[torch.Tensor, torch.Tensor] | None:
         if self.config.bounds == "none":
@@ -127,9 +110,16 @@ class LatentPlanner(MPCPlannerBase):
         statistics, repeat = self.world_model.statistics, self.world_model.frame_skip
         return tuple(statistics.normalize(bound.to(statistics.mean.device)).repeat(repeat) for bound in self.action_bounds)
 
+    @property
+    def context(self) -> int:
+        """The longest context [E, C, D] that is made use of, in frames."""
+        return 1 if self.config.history == "one_frame" else self.world_model.history
+
     def planning(self, td: TensorDictBase) -> torch.Tensor:
         """Writes ``plan`` and ``plan_cost`` into td and returns the first block [E, F * A]."""
-        result = self.plan(td.get(LATENT), td.get(GOAL_LATENT), td.get(PLAN_SEED, None))
+        result = self.plan(
+            td.get(LATENT), td.get(GOAL_LATENT), td.get(PLAN_SEED, None), past_action=td.get(PAST_ACTION, None)
+        )
         td.update(result)
         return result[PLAN][:, 0]
 
@@ -138,72 +128,121 @@ class LatentPlanner(MPCPlannerBase):
         action = self.planning(tensordict)
         return self._write_to_tensordict(tensordict, (action,), tensordict_out)
 
-    @torch.no_grad()
-    def plan(self, latent: torch.Tensor, goal: torch.Tensor, seeds: torch.Tensor | None = None) -> TensorDict:
+    def plan(
+        self,
+        latent: torch.Tensor,
+        goal: torch.Tensor,
+        seeds: torch.Tensor | None = None,
+        *,
+        past_action: torch.Tensor | None = None,
+        initial: torch.Tensor | None = None,
+    ) -> TensorDict:
         """Searches a plan for every environment.
 
         Args:
-            latent: [E, D].
+            latent: [E, D], or a context [E, C, D] with the present last.
             goal: [E, D].
             seeds: [E] int64, names of the random draws.
+            past_action: z-scored blocks executed between the frames of the context [E, C - 1, F * A].
+            initial: mean of the first iteration, z-scored [E, horizon, F * A]; zeros when None.
 
         Returns:
-            ``plan`` [E, horizon, F * A], z-scored, and ``plan_cost`` [E], the cost predicted for it.
+            ``plan`` [E, horizon, F * A], z-scored, and ``plan_cost`` [E], the cost predicted for it. With
+            ``config.trace`` also, under ``trace``, of every iteration (NaN after an early stop): the ``best_cost`` of
+            all candidates, the mean ``elite_cost`` and their mean standard deviation ``spread``, each [E, iterations].
 
         Raises:
-            ValueError: other shapes, or a world model in train mode.
+            ValueError: other shapes, numbers that are not finite, or a world model in train mode.
         """
-        if self.world_model.encoder.training or self.world_model.predictor.training:
-            raise ValueError("the world model is in train mode, where dropout blurs every plan: call its eval().")
-        seeds = range(len(latent)) if seeds is None else seeds.flatten().tolist()
-        if latent.ndim != 2 or goal.shape != latent.shape or len(seeds) != len(latent):
-            raise ValueError(
-                f"expected latents [E, D], goals [E, D] and seeds [E], got {list(latent.shape)}, {list(goal.shape)} "
-                f"and {len(seeds)}."
-            )
-        latent = latent.unsqueeze(1)  # [E, 1, D]: a context of one frame
-        group = 1 if latent.device.type == "cpu" else max(1, len(latent))
-        with self._dynamics_in_precision(latent.device):
+        if latent.ndim == 2:
+            latent = latent.unsqueeze(1)  # [E, 1, D]
+        if past_action is None and latent.ndim == 3 and latent.shape[1] == 1:
+            past_action = latent.new_zeros(len(latent), 0, self.world_model.block_dim)
+        seeds = list(range(len(latent))) if seeds is None else seeds.flatten().tolist()
+        if initial is None:
+            initial = latent.new_zeros(len(latent), self.config.horizon, self.world_model.block_dim)
+        self._check_inputs(latent, goal, seeds, past_action, initial)
+        first = max(0, latent.shape[1] - self.context)
+        latent, past_action = latent[:, first:], past_action[:, first:]
+        group = self._group_size(latent)
+        if self.needs_gradient:
+            mode = torch.inference_mode(False)
+            latent, goal, past_action, initial = (x.clone() for x in (latent, goal, past_action, initial))
+        else:
+            mode = torch.inference_mode()
+        fast = uses_bf16(latent.device, self.config.precision)
+        dynamics = self._fast.of(self.world_model) if fast else self.world_model
+        with mode:
             results = [
-                self._search(latent[i : i + group], goal[i : i + group], seeds[i : i + group])
+                self._search(self._problem(dynamics, *(x[i : i + group] for x in (latent, past_action, goal, initial, seeds))))
                 for i in range(0, len(latent), group)
             ]
-        return torch.cat(results)
+        return torch.cat(results).clone()  # outside the inference mode, so that the user may write into it
 
-    @contextmanager
-    def _dynamics_in_precision(self, device: torch.device) -> Iterator[None]:
-        """Swaps the predictor's weights for bfloat16 copies: autocast would cast them anew at every imagined step."""
-        network = self.world_model.predictor.module
-        if not uses_bf16(device, self.config.precision):
-            yield
-            return
-        weights = TensorDict.from_module(network).detach().apply(_to_bf16)
-        swap = weights.to_module(network, preserve_module_state=False).__enter__()
-        try:
-            yield
-        finally:
-            swap.__exit__(None, None, None)  # tensordict does not restore a module if told about an exception
+    def _check_inputs(self, latent, goal, seeds, past_action, initial) -> None:
+        model, horizon = self.world_model, self.config.horizon
+        if model.encoder.training or model.predictor.training:
+            raise ValueError("the world model is in train mode, where dropout blurs every plan: call its eval().")
+        envs, width, block = len(latent), model.latent_dim, model.block_dim
+        if (
+            latent.ndim != 3
+            or latent.shape[-1] != width
+            or goal.shape != (envs, width)
+            or len(seeds) != envs
+            or initial.shape != (envs, horizon, block)
+        ):
+            raise ValueError(
+                f"expected latents [E, {width}] or [E, C, {width}], goals [E, {width}], seeds [E] and initial plans "
+                f"[E, {horizon}, {block}], got {list(latent.shape)}, {list(goal.shape)}, [{len(seeds)}] and "
+                f"{list(initial.shape)}."
+            )
+        if past_action is None or past_action.shape != (envs, latent.shape[1] - 1, block):
+            raise ValueError(
+                f"a context of {latent.shape[1]} frames needs past_action [{envs}, {latent.shape[1] - 1}, {block}], the "
+                f"z-scored blocks executed between them, got {None if past_action is None else list(past_action.shape)}."
+            )
+        for name, value in (("latents", latent), ("goals", goal), ("past actions", past_action), ("initial plans", initial)):
+            if not value.isfinite().all():
+                raise ValueError(f"there are {name} that are not finite: did training diverge, or is a frame damaged?")
+
+    def _group_size(self, latent: torch.Tensor) -> int:
+        """Environments planned for side by side."""
+        if latent.device.type == "cpu":
+            return 1
+        width = sum(layer.out_features for layer in self.world_model.predictor.modules() if isinstance(layer, nn.Linear))
+        rows = self.config.num_candidates * (self.config.horizon + latent.shape[1] - 1)
+        return max(1, int(self.config.memory_budget * 2**30 / (4 * rows * max(1, width))))
+
+    def _problem(self, dynamics, latent, past_action, goal, initial, seeds) -> Problem:
+        bounds = self.block_bounds()
+        problem = Problem(
+            latent,
+            past_action,
+            goal,
+            initial if bounds is None else initial.clamp(*bounds),
+            bounds,
+            [make_generator(self.config.seed, seed, latent.device) for seed in seeds],
+            functools.partial(self._rollout_cost, dynamics),
+        )
+        if self.policy is not None and self.config.num_proposals:
+            problem.proposals = self.policy.imagine(
+                self.world_model, latent, past_action, goal, self.config.horizon, bounds=bounds
+            ).unsqueeze(1)  # [e, 1, horizon, F * A]
+        return problem
+
+    def _imagined_cost(self, dynamics, latent, past_action, goal, action) -> torch.Tensor:
+        """Cost [e, K] of candidates [e, K, horizon, F * A]; the other shapes are those of a Problem."""
+        candidates = action.shape[1]
+        start = latent.unsqueeze(1).expand(-1, candidates, -1, -1)  # [e, K, C, D]
+        past = past_action.unsqueeze(1).expand(-1, candidates, -1, -1)  # [e, K, C - 1, F * A]
+        blocks = torch.cat([past, action], dim=2)
+        if dynamics is not self.world_model:
+            start, blocks = start.bfloat16(), blocks.bfloat16()
+        predicted = dynamics.rollout(start, blocks).float()  # [e, K, horizon, D]
+        extra = {"action": action, "start": latent[:, -1]}
+        with autocast(latent.device, self.config.precision):
+            return self.cost(predicted, goal, **{name: extra[name] for name in self._wanted}).float()
 
     @abc.abstractmethod
-    def _search(self, latent: torch.Tensor, goal: torch.Tensor, seeds: list[int]) -> TensorDict:
-        """Latents [e, 1, D], goals [e, D], e seeds -> ``plan`` [e, horizon, F * A] and ``plan_cost`` [e]."""
-
-    def _noise(self, seeds: list[int], shape: tuple[int, ...], like: torch.Tensor) -> torch.Tensor:
-        """Standard normal draws [e, *shape] float32, each environment's from its own generator."""
-        draws = []
-        for seed in seeds:
-            state = np.random.SeedSequence([self.config.seed, seed % 2**63]).generate_state(1, np.uint64)[0]
-            generator = torch.Generator().manual_seed(int(state >> np.uint64(1)))
-            draws.append(torch.randn(shape, generator=generator))
-        return torch.stack(draws).to(like.device)
-
-    def _imagined_cost(self, latent: torch.Tensor, goal: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Cost [e, K] of candidates [e, K, horizon, F * A] from latents [e, 1, D]."""
-        start = latent.unsqueeze(1).expand(-1, action.shape[1], -1, -1)  # [e, K, 1, D]
-        dtype = self.world_model.predictor.module.position.dtype
-        predicted = self.world_model.rollout(start.to(dtype), action.to(dtype))  # [e, K, horizon, D]
-        return self.cost(predicted.float(), goal)
-
-
-def _to_bf16(value: torch.Tensor) -> torch.Tensor:
-    return value.bfloat16() if value.is_floating_point() else value
+    def _search(self, problem: Problem) -> TensorDict:
+        """``plan`` [e, horizon, F * A] and ``plan_cost`` [e] of a group of environments."""

@@ -1,0 +1,92 @@
+"""From the ``plan`` group of a configuration to a planner."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+
+from torchrl_ficreg import (
+    ActionEffort,
+    CostSum,
+    GoalDistance,
+    InverseConsistency,
+    InverseDynamicsModel,
+    LatentWorldModel,
+    MPCPolicy,
+    PathDistance,
+    PlanConfig,
+)
+from torchrl_ficreg.modules.goal_policy import load_goal_policy
+from torchrl_ficreg.modules.planners import SEARCHES
+
+POLICY_FOLDER = "goal_policy"  # in a run directory
+COSTS = {"goal": GoalDistance, "path": PathDistance}
+COST_FIELDS = ("cost", "effort", "consistency")
+
+
+def plan_config(plan: DictConfig) -> PlanConfig:
+    """The settings of the search.
+
+    Raises:
+        ValueError: an unknown search or cost, or a setting outside its range.
+    """
+    values = OmegaConf.to_container(plan)
+    search = values.pop("search")
+    if search not in SEARCHES:
+        raise ValueError(f"unknown plan.search {search!r}: choose one of {sorted(SEARCHES)}.")
+    if values.get("cost", "goal") not in COSTS:
+        raise ValueError(f"unknown plan.cost {values['cost']!r}: choose one of {sorted(COSTS)}.")
+    wrong = [f"plan.{name}={values[name]}" for name in COST_FIELDS[1:] if not values.get(name, 0.0) >= 0]
+    if wrong:
+        raise ValueError(f"must not be negative: {', '.join(wrong)}.")
+    settings = {key: value for key, value in values.items() if key not in (*COST_FIELDS, "policy")}
+    return SEARCHES[search].config_class(**settings)
+
+
+def check_horizon(plan: DictConfig, frame_skip: int, budget: int) -> None:
+    """Refuses to imagine further ahead than there are steps.
+
+    Raises:
+        ValueError: the horizon exceeds the budget.
+    """
+    if plan.horizon * frame_skip > budget:
+        raise ValueError(
+            f"plan.horizon={plan.horizon} blocks of {frame_skip} steps reach beyond the budget of {budget} steps: "
+            f"set plan.horizon (and plan.receding_horizon) to at most {budget // frame_skip}, or raise the budget."
+        )
+
+
+def make_cost(plan: DictConfig, inverse_model: InverseDynamicsModel) -> nn.Module:
+    """The cost of the ``plan`` group; further terms are weighted relative to the spread of the first."""
+    first = COSTS[plan.get("cost", "goal")]()
+    effort, consistency = plan.get("effort", 0.0), plan.get("consistency", 0.0)
+    if not effort and not consistency:
+        return first
+    terms = [first, ActionEffort(), InverseConsistency(inverse_model.eval())]
+    return CostSum(terms, [1.0, effort, consistency], scale_free=True)
+
+
+def make_policy(
+    plan: DictConfig,
+    model: LatentWorldModel,
+    inverse_model: InverseDynamicsModel,
+    bounds: tuple[list[float], list[float]],
+    run_dir: Path,
+) -> MPCPolicy:
+    """The planner of a configuration's ``plan`` group, serving one action per environment step.
+
+    Raises:
+        FileNotFoundError: there is no policy where one is wanted.
+    """
+    folder, policy = plan.get("policy"), None
+    if folder is not None:
+        folder = run_dir / POLICY_FOLDER if folder == "auto" else Path(folder)
+        if not folder.exists():
+            raise FileNotFoundError(f"no policy in {folder}: run train_policy.py checkpoint={run_dir} first.")
+        policy = load_goal_policy(folder, model)
+    planner = SEARCHES[plan.search](
+        model, plan_config(plan), action_bounds=bounds, cost=make_cost(plan, inverse_model), policy=policy
+    )
+    return MPCPolicy(planner)

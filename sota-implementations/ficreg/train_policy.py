@@ -1,0 +1,188 @@
+"""Trains a goal-conditioned policy on a run's frozen latents and its dataset.
+
+    python train_policy.py checkpoint=runs/two_room_cpu_ficreg_seed0
+
+It goes beside the run's checkpoints, acts without planning, and proposes plans to a search.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import warnings
+from pathlib import Path
+
+import torch
+from cli import entry_point
+from episodes import dataset_path, find_dataset, make_dataset
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
+from torchrl.objectives import BCLoss
+from tqdm import trange
+from utils import encoder_of, flatten, get_device, versions, write_json
+
+from torchrl_ficreg import LatentWorldModel
+from torchrl_ficreg.data.latents import BLOCKS, encode_episodes, GoalRows
+from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
+from torchrl_ficreg.modules.goal_policy import GoalPolicy, load_goal_policy, require_safetensors, save_goal_policy
+from torchrl_ficreg.modules.precision import autocast, uses_bf16
+from torchrl_ficreg.trainers import find_checkpoint, load_world_model, ModelCard, WarmupCosine
+
+METRICS = "metrics.json"
+# Where things are and how fast they go: settings that make no other policy.
+_FREE = ("checkpoint", "dataset", "output", "overwrite", "device", "frames_per_batch")
+
+
+@entry_point("train_policy")
+def main(cfg: DictConfig) -> None:
+    """Loads, encodes once, trains, measures, writes."""
+    check_settings(cfg)
+    checkpoint = find_checkpoint(cfg.checkpoint)
+    folder = Path(cfg.output or checkpoint.parent.parent / "goal_policy")
+    model, _, card = load_world_model(checkpoint)
+    if (folder / METRICS).exists() and not cfg.overwrite:
+        metrics = read_metrics(cfg, folder, model)
+        print(f"{folder} holds this policy already: overwrite=true trains it again.")
+        report(metrics)
+        return
+    began = time.perf_counter()
+    device = get_device(cfg.device)
+    train_rows, held_out = make_rows(cfg, model.to(device), card)
+    policy = train(cfg, model, train_rows)
+    draw = torch.Generator().manual_seed(cfg.seed)
+    metrics = {
+        "train": measure(policy, train_rows.sample(cfg.validation_rows, generator=draw)),
+        "validation": measure(policy, held_out.sample(cfg.validation_rows, generator=draw)),
+        "rows": {"train": len(train_rows), "validation": len(held_out)},
+        "seconds": time.perf_counter() - began,
+        "checkpoint": checkpoint.name,
+        "config": OmegaConf.to_container(cfg),
+        "versions": versions(),
+    }
+    (folder / METRICS).unlink(missing_ok=True)  # written last, it says that the folder is whole
+    save_goal_policy(policy, folder, model)
+    write_json(folder / METRICS, metrics)
+    report(metrics)
+    print(f"policy and {METRICS} in {folder}")
+
+
+def make_rows(cfg: DictConfig, model: LatentWorldModel, card: ModelCard) -> tuple[GoalRows, GoalRows]:
+    """Rows of the training episodes and of the validation episodes, every frame encoded once."""
+    run = OmegaConf.create(card.config)
+    # Named explicitly, a dataset that has gone is missed rather than recorded anew.
+    run.dataset = cfg.dataset or run.dataset or str(dataset_path(run))
+    path, encode, rows = find_dataset(run), encoder_of(model, cfg.optim.precision), []
+    for split in ("train", "validation"):
+        dataset = make_dataset(run, path, split, num_frames=2, batch_size=None, statistics=model.statistics)
+        latent = encode_episodes(dataset, encode, batch_size=cfg.frames_per_batch, description=f"encode {split}")
+        rows.append(GoalRows(dataset, latent, max_blocks=cfg.max_blocks))
+    return rows[0], rows[1]
+
+
+def train(cfg: DictConfig, model: LatentWorldModel, rows: GoalRows) -> GoalPolicy:
+    """The policy, in eval mode."""
+    torch.manual_seed(cfg.seed)
+    generator = torch.Generator().manual_seed(cfg.seed)
+    network, device = model.predictor.module, rows.latent.device
+    policy = GoalPolicy(network.latent_dim, network.action_dim, **cfg.policy).to(device)
+    policy.standardize_by(rows.latent)
+    with warnings.catch_warnings():  # of TorchRL's, about target parameters that BCLoss has none of
+        warnings.filterwarnings("ignore", message="The name target_actor_network_params")
+        loss_module = BCLoss(policy, loss_function="l2")
+    optim = cfg.optim
+    params = list(policy.parameters())
+    optimizer = torch.optim.AdamW(params, lr=optim.lr, weight_decay=optim.weight_decay, fused=device.type != "mps")
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, WarmupCosine(optim.steps, optim.warmup))
+    with trange(optim.steps, desc="train", unit="step", dynamic_ncols=True) as bar:
+        for step in bar:
+            with autocast(device, optim.precision):
+                loss = loss_module(rows.sample(optim.batch_size, generator=generator))["loss_bc"]
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(params, optim.clip_norm, error_if_nonfinite=True)
+            optimizer.step()
+            optimizer.zero_grad()
+            schedule.step()
+            if step % 50 == 0:  # seldom: on a GPU every look at the loss waits for it
+                bar.set_postfix_str(f"loss {loss.item():.3f}", refresh=False)
+    return policy.eval()
+
+
+@torch.no_grad()
+def measure(policy: GoalPolicy, rows: TensorDict) -> dict:
+    """How well the actions of some rows are recovered: mean squared error and R^2, z-scored, also by distance of goal.
+
+    R^2 is 1 - squared error / variance about the mean, summed over all numbers of a block.
+    """
+    action = rows[ACTION]
+    answer = torch.cat([policy.module(part[LATENT], part[GOAL_LATENT]) for part in rows.split(4096)])
+    error = (answer - action).square().sum(-1).double().cpu()  # [B]
+    spread = (action - action.mean(0)).square().sum(-1).double().cpu()  # [B]
+    blocks = rows[BLOCKS].cpu()
+    near = {int(k): blocks == k for k in blocks.unique()}
+    return {
+        "loss": (error.mean() / action.shape[-1]).item(),
+        "r2": _r2(error, spread),
+        "r2_by_blocks": {str(k): _r2(error[here], spread[here]) for k, here in near.items()},
+    }
+
+
+def _r2(error: torch.Tensor, spread: torch.Tensor) -> float | None:
+    total = spread.sum().item()
+    return 1 - error.sum().item() / total if total > 0 else None  # None where the action never changes
+
+
+def report(metrics: dict) -> None:
+    """Prints what a reader asks for first."""
+    shown = {name: metrics[name]["r2"] for name in ("validation", "train")}
+    held_out, seen = ("-" if value is None else f"{value:.3f}" for value in shown.values())
+    by_blocks = metrics["validation"]["r2_by_blocks"].items()
+    print(f"R^2 of the actions: {held_out} on held-out episodes, {seen} on training episodes")
+    print("by blocks to the goal: " + ", ".join(f"{k}: {'-' if r2 is None else f'{r2:.3f}'}" for k, r2 in by_blocks))
+
+
+def read_metrics(cfg: DictConfig, folder: Path, model: LatentWorldModel) -> dict:
+    """The numbers of a policy trained before, which must be the one asked for.
+
+    Raises:
+        ValueError: it was trained with other settings, or for other weights.
+    """
+    load_goal_policy(folder, model)
+    metrics = json.loads((folder / METRICS).read_text())
+    ours, theirs = flatten(OmegaConf.to_container(cfg)), flatten(metrics["config"])
+    differ = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key) and key not in _FREE]
+    if differ:
+        what = ", ".join(f"{key}: {theirs.get(key)} -> {ours.get(key)}" for key in differ[:3])
+        raise ValueError(f"{folder} holds a policy of other settings ({what}): give overwrite=true, or output=...")
+    return metrics
+
+
+def check_settings(cfg: DictConfig) -> None:
+    """Finds mistakes in a configuration before anything is written.
+
+    Raises:
+        ValueError: a setting outside its range.
+        ImportError: the package that saves policies is missing.
+    """
+    if OmegaConf.is_missing(cfg, "checkpoint"):
+        raise ValueError("name the model to train a policy for: checkpoint=runs/two_room_cpu_ficreg_seed0, say.")
+    optim = cfg.optim
+    positive = {"max_blocks": cfg.max_blocks, "validation_rows": cfg.validation_rows}
+    positive |= {"frames_per_batch": cfg.frames_per_batch}
+    positive |= {f"policy.{key}": value for key, value in cfg.policy.items()}
+    positive |= {f"optim.{key}": optim[key] for key in ("steps", "batch_size", "lr", "clip_norm")}
+    wrong = [f"{key}={value}" for key, value in positive.items() if not value > 0]
+    if wrong:
+        raise ValueError(f"must be positive: {', '.join(wrong)}.")
+    natural = {"seed": cfg.seed, "optim.weight_decay": optim.weight_decay}
+    wrong = [f"{key}={value}" for key, value in natural.items() if not 0 <= value < 2**63]
+    if wrong:
+        raise ValueError(f"must not be negative nor exceed 63 bits: {', '.join(wrong)}.")
+    if not 0 <= optim.warmup < 1:
+        raise ValueError(f"optim.warmup must lie in [0, 1), got {optim.warmup}.")
+    uses_bf16("cpu", optim.precision)
+    get_device(cfg.device)
+    require_safetensors()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""train_policy.py on a trained run: a policy beside the checkpoints that fits the model, and mistakes in one line."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from torchrl_ficreg.modules.goal_policy import load_goal_policy
+from torchrl_ficreg.trainers import load_world_model
+
+SCRIPTS = Path(__file__).resolve().parents[2] / "sota-implementations" / "ficreg"
+RUN = "runs/two_room_cpu_ficreg_seed0"
+SMALL = ["policy.hidden_dim=32", "policy.depth=1", "optim.steps=100", "optim.batch_size=128", "optim.lr=0.01"]
+SMALL += ["validation_rows=500"]
+
+
+@pytest.fixture(scope="module")
+def once(trained, execute, files, tmp_path_factory):
+    """A copy of the trained run, what it held before, and train_policy.py having run there."""
+    folder = shutil.copytree(trained, tmp_path_factory.mktemp("policy") / "copy")
+    before = files(folder)
+    return folder, before, execute(folder, "train_policy.py", f"checkpoint={RUN}", *SMALL, tiny=False)
+
+
+def test_a_policy_appears_beside_the_run_and_nothing_else_changes(once, files):
+    folder, before, done = once
+    assert done.returncode == 0, done.stderr
+    assert "R^2 of the actions" in done.stdout and f"{RUN}/goal_policy" in done.stdout
+    after = files(folder)
+    new = {name.removeprefix(f"{RUN}/goal_policy/") for name in after if name not in before}
+    assert new == {"policy.json", "policy.safetensors", "metrics.json"}
+    assert all(after[name] == content for name, content in before.items())
+    model, _, card = load_world_model(folder / RUN)
+    policy = load_goal_policy(folder / RUN / "goal_policy", model)
+    assert policy.sizes == {"latent_dim": 16, "action_dim": 10, "hidden_dim": 32, "depth": 1}
+
+
+def test_the_metrics_say_what_was_measured(once):
+    """A hundred steps on sixteen episodes are enough to say more about those than their mean action does."""
+    folder, _, _ = once
+    metrics = json.loads((folder / RUN / "goal_policy" / "metrics.json").read_text())
+    assert set(metrics) == {"train", "validation", "rows", "seconds", "checkpoint", "config", "versions"}
+    assert metrics["train"]["r2"] > 0.05
+    for part in ("train", "validation"):
+        assert metrics[part]["r2"] < 1 and metrics[part]["loss"] > 0
+        assert set(metrics[part]["r2_by_blocks"]) <= {str(k) for k in range(1, 11)}
+    assert metrics["rows"]["train"] > metrics["rows"]["validation"] > 0
+    assert str(folder) not in json.dumps(metrics)
+
+
+@pytest.fixture
+def script(monkeypatch):
+    """``script(folder, "optim.steps=3")`` runs it there in this process: a new one each time would be slow."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+
+    def run(folder, *overrides):
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(sys, "argv", ["train_policy.py", *overrides])
+        importlib.import_module("train_policy").main()
+
+    yield run
+    for name in ("train_policy", "cli", "utils", "episodes"):
+        sys.modules.pop(name, None)
+
+
+def test_the_same_command_again_trains_nothing_unless_told_to(once, script, files, capsys):
+    folder, _, _ = once
+    before, line = files(folder), [f"checkpoint={RUN}", *SMALL]
+    script(folder, *line)
+    out, err = capsys.readouterr()
+    assert "holds this policy already: overwrite=true" in out and "R^2 of the actions" in out and "encode" not in err
+    with pytest.raises(SystemExit, match="other settings .optim.steps: 100 -> 3, policy.depth: 1 -> 2.: give over"):
+        script(folder, *line, "optim.steps=3", "policy.depth=2")
+    assert files(folder) == before
+    script(folder, *line, "optim.steps=3", "overwrite=true")
+    metrics = json.loads((folder / RUN / "goal_policy" / "metrics.json").read_text())
+    assert metrics["config"]["optim"]["steps"] == 3
+    assert metrics["rows"] == json.loads(before[f"{RUN}/goal_policy/metrics.json"])["rows"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ([], "name the model to train a policy for: checkpoint=runs/"),
+        ([f"checkpoint={RUN}", "optim.steps=0", "policy.depth=-1"], "must be positive: policy.depth=-1, optim.steps=0"),
+        ([f"checkpoint={RUN}", "optim.warmup=1.0"], r"optim.warmup must lie in \[0, 1\)"),
+        ([f"checkpoint={RUN}", "optim.precision=fp16"], "unknown precision 'fp16'"),
+        ([f"checkpoint={RUN}", "seed=-1"], "must not be negative nor exceed 63 bits: seed=-1"),
+        ([f"checkpoint={RUN}", "max_block=3"], "did you mean 'max_blocks'?"),
+        (["checkpoint=runs/nowhere"], "no checkpoint at runs/nowhere"),
+        ([f"checkpoint={RUN}", "dataset=nowhere"], "no dataset at nowhere"),
+    ],
+)
+def test_a_mistake_is_one_line_and_writes_nothing(trained, script, files, overrides, message, capsys):
+    before = files(trained)
+    with pytest.raises(SystemExit) as caught:
+        script(trained, *overrides)
+    assert re.match("error: .*" + message, caught.value.code) and "\n" not in caught.value.code
+    assert not capsys.readouterr().out
+    assert files(trained) == before

@@ -1,0 +1,283 @@
+"""A goal-conditioned policy on frozen latents: which action block leads towards that goal?"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+
+from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
+from torchrl_ficreg.modules.goal_network import GoalNetwork
+from torchrl_ficreg.modules.world_model import LatentWorldModel
+
+FORMAT, VERSION = "torchrl_ficreg.goal_policy", 1
+CONFIG_FILE, WEIGHTS_FILE = "policy.json", "policy.safetensors"
+
+Bounds = tuple[torch.Tensor, torch.Tensor]
+
+
+class GoalPolicy(TensorDictModule):
+    """``latent`` and ``goal_latent`` [..., D] -> ``action`` [..., F * A], one z-scored action block.
+
+    A plain deterministic regressor: trained on the rows of :class:`~torchrl_ficreg.data.latents.GoalRows`, it answers
+    with the mean of what the recorded agent did on its way from one latent to the other, however far that was
+    (arXiv 2605.08732 trains one that is told the distance too). Alone it is a policy without planning; imagined
+    forward by a world model, see :meth:`imagine`, it proposes whole plans to a search.
+
+    Args:
+        latent_dim, action_dim, hidden_dim, depth: see :class:`~torchrl_ficreg.modules.goal_network.GoalNetwork`.
+        in_keys, out_key: where the latent and the goal latent are read, and the action block is written.
+
+    Raises:
+        ValueError: a size that is not positive.
+
+    Examples:
+        >>> import torch
+        >>> policy = GoalPolicy(latent_dim=16, action_dim=10)
+        >>> policy(latent=torch.zeros(2, 3, 16), goal_latent=torch.zeros(2, 3, 16)).shape
+        torch.Size([2, 3, 10])
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        action_dim: int,
+        hidden_dim: int = 512,
+        depth: int = 3,
+        *,
+        in_keys: tuple[NestedKey, NestedKey] = (LATENT, GOAL_LATENT),
+        out_key: NestedKey = ACTION,
+    ) -> None:
+        network = GoalNetwork(latent_dim, action_dim, hidden_dim, depth)
+        super().__init__(network, in_keys=list(in_keys), out_keys=[out_key])
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The arguments that build the same network."""
+        return self.module.sizes
+
+    def standardize_by(self, latent: torch.Tensor) -> None:
+        """Takes mean and standard deviation of its input from training latents [N, D].
+
+        Raises:
+            ValueError: another width, fewer than two latents, or one that is not finite.
+        """
+        self.module.standardize_by(latent)
+
+    def check_fits(self, world_model: LatentWorldModel) -> None:
+        """Refuses a world model with other latents or action blocks.
+
+        Raises:
+            ValueError: their widths differ.
+        """
+        ours, theirs = self.module, world_model
+        if (ours.latent_dim, ours.action_dim) != (theirs.latent_dim, theirs.block_dim):
+            raise ValueError(
+                f"the policy has latents of {ours.latent_dim} and action blocks of {ours.action_dim}, the world model "
+                f"{theirs.latent_dim} and {theirs.block_dim}: train a policy for this model with train_policy.py."
+            )
+
+    def imagine(
+        self,
+        world_model: LatentWorldModel,
+        latent: torch.Tensor,
+        past_action: torch.Tensor,
+        goal: torch.Tensor,
+        horizon: int,
+        *,
+        bounds: Bounds | None = None,
+    ) -> torch.Tensor:
+        """The plan that the policy would follow if the world went on as the model predicts.
+
+        Block by block: the policy answers the newest latent, and the world model predicts the next one from the last H
+        latents, as :meth:`~torchrl_ficreg.LatentWorldModel.rollout` does on the finished plan.
+
+        Args:
+            world_model: the dynamics, in eval mode.
+            latent: context [..., C, D], oldest first.
+            past_action: z-scored blocks [..., C - 1, F * A] executed between the context frames.
+            goal: [..., D].
+            horizon: N, blocks to imagine.
+            bounds: (low [F * A], high [F * A]), z-scored, between which every block is put before it is imagined.
+
+        Returns:
+            the plan [..., N, F * A], z-scored, in the dtype of ``latent``.
+
+        Raises:
+            ValueError: other shapes, no block to imagine, or a world model of other widths.
+
+        Examples:
+            >>> import torch
+            >>> from torchrl_ficreg import make_world_model, ModelConfig
+            >>> model, _ = make_world_model(ModelConfig.preset("cpu"), action_dim=2)
+            >>> policy, start, goal = GoalPolicy(16, 10), torch.randn(4, 1, 16), torch.randn(4, 16)
+            >>> with torch.inference_mode():
+            ...     plan = policy.imagine(model.eval(), start, torch.zeros(4, 0, 10), goal, horizon=5)
+            >>> plan.shape
+            torch.Size([4, 5, 10])
+        """
+        self.check_fits(world_model)
+        self._check_context(latent, past_action, goal, horizon, bounds)
+        # Planners may keep the predictor in another precision.
+        history, dtype = world_model.history, next(world_model.predictor.parameters(), latent).dtype
+        seen, done = latent[..., -history:, :], past_action[..., max(0, past_action.shape[-2] - history + 1) :, :]
+        plan: list[torch.Tensor] = []
+        while True:
+            block = self.module(seen[..., -1, :], goal).to(latent.dtype)  # [..., F * A]
+            block = block if bounds is None else block.clamp(*bounds)
+            plan.append(block)
+            if len(plan) == horizon:
+                return torch.stack(plan, dim=-2)
+            done = torch.cat([done, block.unsqueeze(-2)], dim=-2)[..., -history:, :]  # as many as seen
+            following = world_model.predict(seen.to(dtype), done.to(dtype))[..., -1:, :]
+            seen = torch.cat([seen, following.to(latent.dtype)], dim=-2)[..., -history:, :]
+
+    def _check_context(
+        self, latent: torch.Tensor, past_action: torch.Tensor, goal: torch.Tensor, horizon: int, bounds: Bounds | None
+    ) -> None:
+        if (
+            horizon < 1
+            or min(latent.ndim, past_action.ndim) < 2
+            or latent.shape[-2] < 1
+            or goal.shape != (*latent.shape[:-2], self.module.latent_dim)
+            or past_action.shape != (*latent.shape[:-2], latent.shape[-2] - 1, self.module.action_dim)
+        ):
+            raise ValueError(
+                f"imagine takes latents [..., C, {self.module.latent_dim}], the C - 1 past blocks "
+                f"[..., C - 1, {self.module.action_dim}], goals [..., {self.module.latent_dim}] and a horizon >= 1, got "
+                f"{list(latent.shape)}, {list(past_action.shape)}, {list(goal.shape)} and {horizon}."
+            )
+        if bounds is not None and any(bound.shape != (self.module.action_dim,) for bound in bounds):
+            got = " and ".join(str(list(bound.shape)) for bound in bounds)
+            raise ValueError(f"bounds must be two vectors [{self.module.action_dim}], low and high, got {got}.")
+
+
+def save_goal_policy(policy: GoalPolicy, folder: Path | str, world_model: LatentWorldModel) -> Path:
+    """Writes ``policy.safetensors`` and ``policy.json``, readable without running anything that is in them.
+
+    What the policy depends on is noted with it: the encoder's weights and the action statistics, as a checksum. Weights
+    are written in float32. Keys of the module are not kept: a loaded policy reads and writes the standard ones.
+
+    Args:
+        policy: to save.
+        folder: made if missing; a policy already there is replaced.
+        world_model: whose latents it was trained on.
+
+    Returns:
+        the folder.
+
+    Raises:
+        ImportError: safetensors is not installed.
+        ValueError: the policy does not fit the world model.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from torchrl_ficreg import make_world_model, ModelConfig
+        >>> model, _ = make_world_model(ModelConfig.preset("cpu"), action_dim=2)
+        >>> policy, latent = GoalPolicy(16, 10), torch.randn(3, 16)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     same = load_goal_policy(save_goal_policy(policy, folder, model), model)
+        >>> torch.equal(same.module(latent, -latent), policy.module(latent, -latent))
+        True
+    """
+    safetensors = require_safetensors()
+    policy.check_fits(world_model)
+    content = {"format": FORMAT, "version": VERSION, "sizes": policy.sizes, "world_model": _checksum(world_model)}
+    folder = Path(folder).expanduser()
+    folder.mkdir(parents=True, exist_ok=True)
+    # The configuration goes first and comes last: cut short, the folder holds no policy rather than a mixed one.
+    (folder / CONFIG_FILE).unlink(missing_ok=True)
+    tensors = {name: value.detach().float().cpu().contiguous() for name, value in policy.module.state_dict().items()}
+    safetensors.torch.save_file(tensors, folder / WEIGHTS_FILE, metadata={"format": "pt"})
+    (folder / CONFIG_FILE).write_text(json.dumps(content, indent=2) + "\n")
+    return folder
+
+
+def load_goal_policy(
+    folder: Path | str, world_model: LatentWorldModel, *, device: torch.device | str = "cpu"
+) -> GoalPolicy:
+    """Reads what :func:`save_goal_policy` wrote, for the world model it was trained with.
+
+    Args:
+        folder: with ``policy.json`` and ``policy.safetensors``.
+        world_model: whose latents the policy will read.
+        device: where the policy goes.
+
+    Returns:
+        the policy, in eval mode.
+
+    Raises:
+        ImportError: safetensors is not installed.
+        FileNotFoundError: no such files.
+        ValueError: another format or version, damaged files, files that do not belong together, or a world model of
+            other widths, encoder weights or action statistics than the policy's own.
+    """
+    safetensors = require_safetensors()
+    folder = Path(folder).expanduser()
+    for name in (CONFIG_FILE, WEIGHTS_FILE):
+        if not (folder / name).is_file():
+            raise FileNotFoundError(f"no {name} in {folder}: train a policy with train_policy.py checkpoint=...")
+    content = _read_config(folder / CONFIG_FILE)
+    try:
+        tensors = safetensors.torch.load_file(folder / WEIGHTS_FILE)
+    except safetensors.SafetensorError as error:
+        raise ValueError(f"{folder / WEIGHTS_FILE} is damaged ({error}): train the policy again.") from error
+    try:
+        policy, checksum = GoalPolicy(**content["sizes"]), content["world_model"]
+        policy.module.load_state_dict(tensors)
+    except (KeyError, TypeError, RuntimeError) as error:  # a missing field, a foreign one, tensors of another network
+        reason = " ".join(str(error).split())
+        raise ValueError(
+            f"{folder}: {CONFIG_FILE} and {WEIGHTS_FILE} do not belong together ({reason}): train the policy again."
+        ) from error
+    policy.check_fits(world_model)
+    if checksum != _checksum(world_model):
+        raise ValueError(
+            f"{folder} holds a policy that was trained on another encoder or other action statistics: train one for "
+            "this model with train_policy.py, overwrite=true."
+        )
+    return policy.to(device).eval()
+
+
+def require_safetensors() -> ModuleType:
+    """The package by which policies are saved, looked for before there is something to lose.
+
+    Raises:
+        ImportError: it is not installed.
+    """
+    try:
+        import safetensors.torch
+    except ImportError as error:
+        raise ImportError("safetensors is missing: pip install 'torchrl_ficreg[pretrained]'.") from error
+    return safetensors
+
+
+def _read_config(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{file} is not JSON ({error}): train the policy again.") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"{file} is not of the format {FORMAT!r}: give a folder that save_goal_policy wrote.")
+    if content.get("version") != VERSION:
+        raise ValueError(
+            f"{file} has version {content.get('version')!r}, this release reads {VERSION}: update torchrl_ficreg."
+        )
+    return content
+
+
+def _checksum(world_model: LatentWorldModel) -> str:
+    """Changes with any weight of the encoder and with the action statistics: all that a policy's numbers refer to."""
+    state = {**world_model.encoder.state_dict(), **dict(world_model.named_buffers(recurse=False))}
+    digest = hashlib.sha256()
+    for name in sorted(state):
+        digest.update(name.encode())
+        digest.update(state[name].detach().float().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

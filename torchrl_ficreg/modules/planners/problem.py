@@ -1,0 +1,56 @@
+"""What a search is given: environments that can be asked what action sequences would cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+ImaginedCost = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
+
+
+@dataclass
+class Problem:
+    """A group of e environments to be planned for side by side; no environment's plan depends on another's.
+
+    Attributes:
+        latent: context [e, C, D], oldest first.
+        past_action: z-scored blocks executed between the frames of the context [e, C - 1, F * A].
+        goal: [e, D].
+        initial: mean of the first iteration [e, horizon, F * A].
+        bounds: of a z-scored block, (low [F * A], high [F * A]), or None.
+        generators: one for each environment.
+        imagined_cost: (latent, past_action, goal, candidates [e, K, horizon, F * A]) -> [e, K].
+        proposals: what a policy would do [e, P, horizon, F * A], or None.
+    """
+
+    latent: torch.Tensor
+    past_action: torch.Tensor
+    goal: torch.Tensor
+    initial: torch.Tensor
+    bounds: tuple[torch.Tensor, torch.Tensor] | None
+    generators: list[torch.Generator]
+    imagined_cost: ImaginedCost
+    proposals: torch.Tensor | None = field(default=None)
+
+    def cost(self, candidates: torch.Tensor) -> torch.Tensor:
+        """Imagined cost [e, K] of z-scored action blocks [e, K, horizon, F * A]."""
+        return self.imagined_cost(self.latent, self.past_action, self.goal, candidates)
+
+    def clamp(self, action: torch.Tensor) -> torch.Tensor:
+        """Blocks [..., F * A] inside the bounds."""
+        return action if self.bounds is None else action.clamp(*self.bounds)
+
+    def noise(self, count: int) -> torch.Tensor:
+        """Standard normal draws [e, count, horizon, F * A], each environment's from its own generator."""
+        shape = (count, *self.initial.shape[1:])
+        device = self.initial.device
+        return torch.stack([torch.randn(shape, generator=g, device=device) for g in self.generators])
+
+
+def make_generator(seed: int, environment: int, device: torch.device) -> torch.Generator:
+    """The random draws of one environment, named by a search's seed and the environment's own."""
+    state = np.random.SeedSequence([seed, environment % 2**63]).generate_state(1, np.uint64)[0]
+    return torch.Generator(device).manual_seed(int(state >> np.uint64(1)))

@@ -33,7 +33,7 @@ study: $(READY)
 # Everything in one call, so that pip sees all requirements at once; the marker is written only when it succeeded.
 $(READY): pyproject.toml constraints.txt
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install -q -c constraints.txt -e '.[envs,plot]'
+	$(VENV)/bin/pip install -q -c constraints.txt -e '.[envs,plot,pretrained]'
 	touch $@
 
 $(TESTABLE): pyproject.toml constraints.txt

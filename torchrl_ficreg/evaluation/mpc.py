@@ -19,6 +19,7 @@ from torchrl_ficreg.envs import make_env
 from torchrl_ficreg.evaluation.pairs import StartGoalPairs
 from torchrl_ficreg.evaluation.statistics import wilson_interval
 from torchrl_ficreg.modules.planners.common import PLAN_SEED
+from torchrl_ficreg.modules.planners.mpc import MPCPolicy
 
 
 class UniformPolicy(TensorDictModuleBase):
@@ -135,12 +136,20 @@ def evaluate_mpc(
         progress_bar, description: of the progress bar.
 
     Raises:
-        ValueError: ``budget`` or ``num_envs`` below 1, ``num_workers`` too, or ``env_kwargs`` that are set here.
+        ValueError: ``budget`` or ``num_envs`` below 1, ``num_workers`` too, ``env_kwargs`` that are set here, or a
+            planner that imagines further ahead than ``budget`` steps.
     """
     if budget < 1 or num_envs < 1:
         raise ValueError(f"budget and num_envs must be positive, got {budget} and {num_envs}.")
     if num_workers is not None and num_workers < 1:
         raise ValueError(f"num_workers must be None or at least 1, got {num_workers}.")
+    if isinstance(policy, MPCPolicy):
+        ahead = policy.planner.config.horizon * policy.planner.world_model.frame_skip
+        if ahead > budget:
+            raise ValueError(
+                f"the planner imagines {ahead} steps ahead, the budget is {budget}: shorten its horizon (action blocks "
+                f"of {policy.planner.world_model.frame_skip} steps), or raise the budget."
+            )
     taken = {"image_size", "terminate_on_success", "num_envs", "num_workers", "seed"} & set(env_kwargs or {})
     if taken:
         raise ValueError(f"env_kwargs must not hold {sorted(taken)}: evaluate_mpc sets them.")

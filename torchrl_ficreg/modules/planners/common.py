@@ -165,14 +165,11 @@ class LatentPlanner(MPCPlannerBase):
         first = max(0, latent.shape[1] - self.context)
         latent, past_action = latent[:, first:], past_action[:, first:]
         group = self._group_size(latent)
-        if self.needs_gradient:
-            mode = torch.inference_mode(False)
-            latent, goal, past_action, initial = (x.clone() for x in (latent, goal, past_action, initial))
-        else:
-            mode = torch.inference_mode()
         fast = uses_bf16(latent.device, self.config.precision)
         dynamics = self._fast.of(self.world_model) if fast else self.world_model
-        with mode:
+        with torch.inference_mode(not self.needs_gradient), torch.no_grad():
+            if self.needs_gradient:  # autograd keeps no tensor that was made in an inference mode outside
+                latent, past_action, goal, initial = (x.clone() for x in (latent, past_action, goal, initial))
             results = [
                 self._search(self._problem(dynamics, *(x[i : i + group] for x in (latent, past_action, goal, initial, seeds))))
                 for i in range(0, len(latent), group)

@@ -46,10 +46,9 @@ class GradientPlanner(LatentPlanner):
             optimizer.step()
             candidates.data = problem.clamp(candidates.data)
         candidates = candidates.detach()
-        cost = problem.cost(candidates)
-        best = cost.argmin(1)  # [e]
-        rows = torch.arange(len(best), device=best.device)
-        result = {PLAN: candidates[rows, best], PLAN_COST: cost[rows, best]}
+        best = problem.cost(candidates).argmin(1)  # [e]
+        plan = candidates[torch.arange(len(best), device=best.device), best]  # [e, H, F * A]
+        result = {PLAN: plan, PLAN_COST: problem.cost(plan.unsqueeze(1))[:, 0]}
         if config.trace:
             names = ("best_cost", "elite_cost", "spread")
             columns = (torch.stack(column, dim=1).detach() for column in zip(*trace))

@@ -34,7 +34,8 @@ class LatentICEMPlanner(SamplingPlanner):
         return [max(smallest, size) for size in sizes]
 
     def _kept(self) -> int:
-        return int(self.config.kept_elites * self.config.num_elites)
+        kept = int(self.config.kept_elites * self.config.num_elites)
+        return min(kept, self._population()[-1] - 1)  # candidate 0 is the mean
 
     def _colour(self, noise: torch.Tensor) -> torch.Tensor:
         raw = noise.unflatten(-1, (self.world_model.frame_skip, -1)).flatten(2, 3)  # [e, K, H * F, A]

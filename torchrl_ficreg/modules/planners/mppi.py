@@ -27,8 +27,9 @@ class LatentMPPIPlanner(SamplingPlanner):
     config_class = MPPIConfig
 
     def _fit(self, elites, cost, mean, std) -> tuple[torch.Tensor, torch.Tensor]:
-        spread = cost.std(1, keepdim=True).clamp_min(torch.finfo(cost.dtype).tiny)  # [e, 1]
-        weight = torch.softmax((cost[:, :1] - cost) / (self.config.temperature * spread), dim=1)[..., None, None]
+        scale = self.config.temperature * cost.std(1, keepdim=True)  # [e, 1]
+        scale = scale.clamp_min(torch.finfo(cost.dtype).tiny)  # elites on the same corner of the bounds cost the same
+        weight = torch.softmax((cost[:, :1] - cost) / scale, dim=1)[..., None, None]
         mean = (weight * elites).sum(1)
         variance = (weight * (elites - mean.unsqueeze(1)).square()).sum(1)
         return mean, variance.sqrt().clamp(self.config.min_std, self.config.std)

@@ -1,0 +1,264 @@
+"""Claims about costs: each is its formula, a scale-free sum knows no units, and a planner gives a cost what it names."""
+
+from __future__ import annotations
+
+import functools
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
+
+from torchrl_ficreg import (
+    ActionEffort,
+    CostSum,
+    GoalDistance,
+    InverseConsistency,
+    InverseDynamicsModel,
+    LatentCEMPlanner,
+    LatentMPPIPlanner,
+    MPPIConfig,
+    PathDistance,
+    PlanConfig,
+)
+
+UNIT = ([-1.0, -1.0], [1.0, 1.0])
+FAST = {"num_candidates": 32, "num_elites": 6, "iterations": 5, "horizon": 3, "receding_horizon": 1, "precision": "fp32"}
+
+
+@pytest.fixture
+def imagined():
+    """Predictions [2, 5, 3, 4], goals [2, 4], action blocks [2, 5, 3, 6] and starts [2, 4]."""
+    return torch.randn(2, 5, 3, 4), torch.randn(2, 4), torch.randn(2, 5, 3, 6), torch.randn(2, 4)
+
+
+def each(formula):
+    """A formula of environment and candidate, over all of them: [2, 5]."""
+    return torch.stack([torch.stack([formula(e, k) for k in range(5)]) for e in range(2)])
+
+
+# Formulas
+
+
+def test_goal_distance_looks_at_the_last_latent_alone(imagined):
+    predicted, goal, *_ = imagined
+    expected = each(lambda e, k: sum((predicted[e, k, 2, d] - goal[e, d]) ** 2 for d in range(4)))
+    torch.testing.assert_close(GoalDistance()(predicted, goal), expected)
+
+
+@pytest.mark.parametrize(("discount", "weights"), [(1.0, (1 / 3, 1 / 3, 1 / 3)), (0.5, (1 / 7, 2 / 7, 4 / 7))])
+def test_path_distance_is_a_weighted_mean_over_the_blocks(imagined, discount, weights):
+    predicted, goal, *_ = imagined
+    distance = each(lambda e, k: sum(w * (predicted[e, k, t] - goal[e]).square().sum() for t, w in enumerate(weights)))
+    torch.testing.assert_close(PathDistance(discount)(predicted, goal), distance)
+
+
+@pytest.mark.parametrize("discount", [0.0, 1.5, float("nan")])
+def test_a_discount_out_of_range_is_refused(discount):
+    with pytest.raises(ValueError, match=r"discount must lie in \(0, 1\]"):
+        PathDistance(discount)
+
+
+def test_effort_is_the_mean_squared_z_score(imagined):
+    predicted, goal, action, _ = imagined
+    expected = each(lambda e, k: sum(value**2 for value in action[e, k].flatten()) / 18)
+    torch.testing.assert_close(ActionEffort()(predicted, goal, action), expected)
+
+
+def test_consistency_is_the_error_of_the_recovered_actions(imagined):
+    """Step by step: the judge sees where a block began and where it is imagined to lead."""
+    predicted, goal, action, start = imagined
+    judge = InverseDynamicsModel(latent_dim=4, action_dim=6, hidden_dim=8).eval()
+
+    def error(e, k):
+        before, total = start[e], 0.0
+        for t in range(3):
+            recovered = judge(latent=before, next_latent=predicted[e, k, t])
+            total = total + (recovered - action[e, k, t]).square().sum() / 18
+            before = predicted[e, k, t]
+        return total
+
+    with torch.no_grad():
+        torch.testing.assert_close(InverseConsistency(judge)(predicted, goal, action, start), each(error))
+
+
+# Consistency
+
+
+class Difference(nn.Module):
+    """z' - z, at most one in size: the inverse of z' = z + a as far as it has been seen."""
+
+    def forward(self, latent, next_latent):
+        return (next_latent - latent).clamp(-1.0, 1.0)
+
+
+@pytest.fixture
+def judge():
+    return TensorDictModule(Difference(), [("now", "z"), ("then", "z")], ["recovered"])
+
+
+def test_actions_that_are_recovered_exactly_cost_nothing(judge):
+    """Its keys may be nested."""
+    start, action = torch.randn(2, 4), 0.9 * torch.rand(2, 5, 3, 4)
+    path = start[:, None, None] + action.cumsum(2)  # z' = z + a
+    cost = InverseConsistency(judge)
+    torch.testing.assert_close(cost(path, start, action, start), torch.zeros(2, 5))
+    assert (cost(path, start, action + 0.5, start) > 0.2).all()
+
+
+def test_with_it_a_planner_stays_where_the_judge_can_follow(linear_world, judge):
+    """The goal is 10 away and there are three blocks: without the judge they are 3.3 long, with it about 1."""
+    config = PlanConfig(**{**FAST, "num_candidates": 200, "num_elites": 20, "iterations": 30}, bounds="none")
+    latent, goal = torch.zeros(1, 2), torch.tensor([[10.0, 0.0]])
+    both = CostSum([GoalDistance(), InverseConsistency(judge)], [1.0, 3.0], scale_free=True)
+    longest = []
+    for cost in (GoalDistance(), both):
+        plan = LatentCEMPlanner(linear_world(1), config, cost=cost).plan(latent, goal)["plan"]
+        longest.append(plan.abs().max().item())
+    assert longest[0] > 3 and longest[1] < 1.5
+
+
+# Sums
+
+
+def test_a_sum_weighs_its_terms(imagined):
+    predicted, goal, action, start = imagined
+    cost = CostSum([PathDistance(), ActionEffort(), GoalDistance()], [0.5, 2.0, 0.0])
+    expected = 0.5 * PathDistance()(predicted, goal) + 2.0 * action.square().mean((-1, -2))
+    torch.testing.assert_close(cost(*imagined), expected)
+
+
+class Scaled(nn.Module):
+    """Another cost in other units."""
+
+    def __init__(self, cost, scale, shift):
+        super().__init__()
+        self.cost, self.scale, self.shift = cost, scale, shift
+
+    def forward(self, predicted, goal, action):
+        cost = self.cost(predicted, goal, action) if isinstance(self.cost, ActionEffort) else self.cost(predicted, goal)
+        return self.scale * cost + self.shift
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(100.0, 0.0), (1e-3, 5.0), (7.0, -30.0)])
+def test_a_scale_free_sum_prefers_the_same_whatever_the_units(imagined, scale, shift):
+    """Differences between candidates, in units of the first term, do not depend on the units of either term."""
+
+    def preferences(first, second):
+        cost = CostSum([first, second], [1.0, 0.5], scale_free=True)(*imagined)  # [E, K]
+        return (cost - cost.mean(1, keepdim=True)) / cost.std(1, keepdim=True)
+
+    expected = preferences(GoalDistance(), ActionEffort())
+    for pair in (
+        (Scaled(GoalDistance(), scale, shift), ActionEffort()),
+        (GoalDistance(), Scaled(ActionEffort(), scale, shift)),
+    ):
+        torch.testing.assert_close(preferences(*pair), expected, rtol=1e-3, atol=1e-3)
+    plain = CostSum([GoalDistance(), Scaled(ActionEffort(), scale, shift)], [1.0, 0.5])(*imagined)
+    assert not torch.allclose((plain - plain.mean(1, keepdim=True)) / plain.std(1, keepdim=True), expected, atol=1e-2)
+
+
+def test_half_the_weight_is_half_the_say(imagined):
+    """The second term's part of a scale-free sum has half the standard deviation of the first, environment by environment."""
+    predicted, goal, *_ = imagined
+    first = GoalDistance()(predicted, goal)
+    part = CostSum([GoalDistance(), ActionEffort()], [1.0, 0.5], scale_free=True)(*imagined) - first
+    torch.testing.assert_close(part.std(1), 0.5 * first.std(1))
+
+
+def test_a_plan_on_its_own_costs_what_the_first_term_says(imagined):
+    predicted, goal, action, start = imagined
+    cost = CostSum([GoalDistance(), ActionEffort()], [2.0, 0.5], scale_free=True)
+    alone = cost(predicted[:, :1], goal, action[:, :1], start)
+    torch.testing.assert_close(alone, 2 * GoalDistance()(predicted[:, :1], goal))
+
+
+def test_a_term_without_spread_takes_no_part(imagined):
+    """Neither as a second term, where its scale would be infinite, nor does it pass a NaN on as a gradient."""
+    predicted, goal, action, start = imagined
+    same = torch.ones_like(action).requires_grad_()
+    cost = CostSum([GoalDistance(), ActionEffort()], [1.0, 0.5], scale_free=True)(predicted, goal, same, start)
+    torch.testing.assert_close(cost, GoalDistance()(predicted, goal))
+    (gradient,) = torch.autograd.grad(cost.sum(), same)
+    assert (gradient == 0).all()
+
+
+@pytest.mark.parametrize(("terms", "weights"), [([], []), ([GoalDistance()], [1.0, 2.0])])
+def test_a_sum_without_terms_or_with_other_weights_is_refused(terms, weights):
+    with pytest.raises(ValueError, match="at least one term and a weight for each"):
+        CostSum(terms, weights)
+
+
+# In a planner
+
+
+class NamesAction(nn.Module):
+    def forward(self, predicted, goal, action):
+        return (predicted[:, :, -1] - goal[:, None]).square().sum(-1) + 0 * action.sum((-1, -2))
+
+
+class NamesStart(nn.Module):
+    def forward(self, predicted, goal, start):
+        return (predicted[:, :, -1] - goal[:, None]).square().sum(-1) + 0 * start.sum(-1, keepdim=True)
+
+
+def function(predicted, goal):
+    return (predicted[:, :, -1] - goal[:, None]).square().sum(-1)
+
+
+def takes_all(predicted, goal, **extra):
+    assert set(extra) == {"action", "start"}
+    assert extra["action"].shape[:3] == predicted.shape[:3] and extra["start"].shape == goal.shape
+    return function(predicted, goal)
+
+
+def settled(predicted, goal, power):
+    return (predicted[:, :, -1] - goal[:, None]).pow(power).sum(-1)
+
+
+@pytest.mark.parametrize(
+    "cost",
+    [
+        NamesAction(),
+        NamesStart(),
+        function,
+        takes_all,
+        functools.partial(settled, power=2),
+        CostSum([GoalDistance()], [1.0]),
+        CostSum([GoalDistance(), NamesStart()], [0.5, 0.5]),
+    ],
+)
+def test_a_cost_is_given_what_it_names(tiny_world, cost):
+    """However it asks: all of these measure the distance from the goal."""
+    world, latent, goal = tiny_world(), torch.randn(2, 6), torch.randn(2, 6)
+    expected = LatentCEMPlanner(world, PlanConfig(**FAST), action_bounds=UNIT).plan(latent, goal)
+    result = LatentCEMPlanner(world, PlanConfig(**FAST), action_bounds=UNIT, cost=cost).plan(latent, goal)
+    torch.testing.assert_close(result["plan"], expected["plan"])
+    torch.testing.assert_close(result["plan_cost"], expected["plan_cost"])
+
+
+def test_start_is_the_present_and_action_the_candidates(tiny_world):
+    """With a context of three frames: its last one; and neither the past blocks nor the past frames."""
+    seen = {}
+
+    def noted(predicted, goal, action, start):
+        seen.update(predicted=predicted, action=action, start=start)
+        return function(predicted, goal)
+
+    planner = LatentCEMPlanner(tiny_world(), PlanConfig(**FAST), action_bounds=UNIT, cost=noted)
+    context = torch.randn(1, 3, 6)
+    plan = planner.plan(context, torch.randn(1, 6), past_action=torch.randn(1, 2, 4))["plan"]
+    assert seen["start"].equal(context[:, -1])
+    assert seen["action"].equal(plan[:, None])  # the last question is the cost of the plan
+    assert seen["predicted"].shape == (1, 1, 3, 6)
+
+
+def test_a_scale_free_sum_plans_the_same_in_other_units(linear_world):
+    """MPPI weighs candidates by cost: even those weights do not change."""
+    config = MPPIConfig(**{**FAST, "num_elites": 16}, bounds="none")
+    plans = []
+    for effort in (ActionEffort(), Scaled(ActionEffort(), 1000.0, 3.0)):
+        cost = CostSum([GoalDistance(), effort], [1.0, 0.3], scale_free=True)
+        planner = LatentMPPIPlanner(linear_world(), config, cost=cost)
+        plans.append(planner.plan(torch.zeros(2, 2), torch.tensor([[3.0, 1.0], [-2.0, 0.5]]))["plan"])
+    torch.testing.assert_close(plans[1], plans[0], rtol=1e-2, atol=1e-2)

@@ -1,0 +1,329 @@
+"""Claims about all searches.
+
+They reach the optimum of a linear-quadratic world, inside the bounds and on them. A plan depends neither on who else is
+planned for nor on whether that happens side by side. Every iteration can be traced. Bad input is refused before anything
+is imagined, and no gradient mode that a user is in changes a plan.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
+
+from torchrl_ficreg import ActionEffort, CostSum, GoalDistance, GoalPolicy, LatentWorldModel, PlanConfig
+from torchrl_ficreg.modules.planners import ICEMConfig, SEARCHES
+from torchrl_ficreg.modules.planners.common import LatentPlanner
+
+UNIT = ([-1.0, -1.0], [1.0, 1.0])
+EFFORT, HORIZON = 8.0, 4
+SAMPLING = ["cem", "icem", "mppi", "shooting"]
+SEARCHING = [*SAMPLING, "gradient"]
+OPTIMAL = {
+    "cem": {"num_candidates": 400, "num_elites": 40, "iterations": 20},
+    "icem": {"num_candidates": 400, "num_elites": 40, "iterations": 20, "noise_beta": 0.5, "decay": 1.05},
+    "mppi": {"num_candidates": 400, "num_elites": 80, "iterations": 20, "min_std": 0.01},
+    "gradient": {"num_candidates": 4, "num_elites": 2, "iterations": 150, "learning_rate": 0.1},
+}
+FAST = {"num_candidates": 24, "num_elites": 5, "iterations": 4, "horizon": 3, "receding_horizon": 1, "precision": "fp32"}
+
+
+def make(search, world, *, cost=None, policy=None, **settings):
+    """A planner of that name; bounds of one in every direction."""
+    kind = SEARCHES[search]
+    return kind(world, kind.config_class(**{**FAST, **settings}), action_bounds=UNIT, cost=cost, policy=policy)
+
+
+@pytest.fixture
+def policy():
+    torch.manual_seed(1)
+    return GoalPolicy(latent_dim=6, action_dim=4, hidden_dim=16, depth=2).eval()
+
+
+# Known optima
+
+
+class Linear(nn.Module):
+    """z' = A z + B u in three dimensions, driven by two: nothing like the plane of the other tests."""
+
+    history, latent_dim, action_dim = 1, 3, 2
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("free", torch.tensor([[0.9, 0.3, 0.0], [-0.3, 0.9, 0.2], [0.0, -0.2, 0.8]]))  # A
+        self.register_buffer("driven", torch.tensor([[1.0, 0.0], [0.2, 0.5], [0.0, 1.0]]))  # B
+
+    def forward(self, latent, action):
+        return latent @ self.free.T + action @ self.driven.T
+
+
+@pytest.fixture
+def quadratic_world():
+    encoder = TensorDictModule(nn.Identity(), ["pixels"], ["latent"])
+    predictor = TensorDictModule(Linear(), ["latent", "action"], ["predicted_latent"])
+    return LatentWorldModel(encoder, predictor, frame_skip=1).eval()
+
+
+def closed_form(latent, goal, low=-torch.inf, high=torch.inf):
+    """Best actions [E, H, 2] and their costs [E]: |M u - (g - A^H z)|^2 + EFFORT mean(u^2), low <= u <= high."""
+    network, number = Linear().double(), 2 * HORIZON
+    powers = [torch.linalg.matrix_power(network.free, k) for k in range(HORIZON + 1)]
+    way = torch.cat([powers[HORIZON - 1 - t] @ network.driven for t in range(HORIZON)], dim=1)  # M [3, H * 2]
+    rows = torch.cat([way, (EFFORT / number) ** 0.5 * torch.eye(number, dtype=torch.float64)])  # [3 + H * 2, H * 2]
+    missing = goal.double() - latent.double() @ powers[HORIZON].T
+    target = torch.cat([missing, missing.new_zeros(len(goal), number)], dim=1)  # [E, 3 + H * 2]
+    action = torch.linalg.lstsq(rows, target.T).solution.T  # [E, H * 2]
+    if torch.isfinite(torch.as_tensor(high)):
+        step = 1 / torch.linalg.matrix_norm(rows, 2) ** 2
+        for _ in range(4000):  # projected gradient: a convex problem in a box
+            action = (action - step * (action @ rows.T - target) @ rows).clamp(low, high)
+    cost = (action @ rows.T - target).square().sum(1)
+    return action.unflatten(1, (HORIZON, 2)).float(), cost.float()
+
+
+@pytest.fixture
+def solve(quadratic_world):
+    """``solve(search, latent, goal, **settings)``: distance at the end and effort, four blocks ahead."""
+    cost = CostSum([GoalDistance(), ActionEffort()], [1.0, EFFORT])
+
+    def solve(search, latent, goal, **settings):
+        settings = {**OPTIMAL.get(search, {}), "horizon": HORIZON, **settings}
+        return make(search, quadratic_world, cost=cost, **settings).plan(latent, goal)
+
+    return solve
+
+
+@pytest.fixture
+def tasks():
+    """Starts and goals [5, 3] a few units apart."""
+    generator = torch.Generator().manual_seed(0)
+    return torch.randn(5, 3, generator=generator), 2 * torch.randn(5, 3, generator=generator)
+
+
+@pytest.mark.parametrize("search", OPTIMAL)
+def test_the_optimum_of_a_linear_quadratic_world_is_reached(solve, tasks, search):
+    """Within 0.1 % of the cost, and within 0.03 z-scores of the only best actions."""
+    action, lowest = closed_form(*tasks)
+    result = solve(search, *tasks, bounds="none")
+    torch.testing.assert_close(result["plan_cost"], lowest, rtol=1e-3, atol=0)
+    assert (result["plan_cost"] >= lowest * (1 - 1e-5)).all()
+    torch.testing.assert_close(result["plan"], action, rtol=0, atol=0.03)
+
+
+@pytest.mark.parametrize("search", OPTIMAL)
+def test_bounds_that_are_active_at_the_optimum_are_met(solve, tasks, search):
+    """Goals three times as far: four of five need some full actions, none needs nothing else."""
+    latent, goal = tasks[0], 3 * tasks[1]
+    action, lowest = closed_form(latent, goal, -1.0, 1.0)
+    full = action.abs() == 1
+    assert full.any((1, 2)).sum() == 4 and not full.all((1, 2)).any()
+    result = solve(search, latent, goal)
+    assert result["plan"].abs().max() <= 1
+    torch.testing.assert_close(result["plan_cost"], lowest, rtol=1e-3, atol=0)
+    torch.testing.assert_close(result["plan"], action, rtol=0, atol=0.03)
+    torch.testing.assert_close(result["plan"][full], action[full], rtol=0, atol=0.01)
+
+
+def test_random_shooting_is_better_than_doing_nothing_and_worse_than_the_optimum(solve, tasks):
+    _, lowest = closed_form(*tasks)
+    cost = solve("shooting", *tasks, bounds="none", num_candidates=200, num_elites=2)["plan_cost"]
+    idle = (tasks[1] - tasks[0] @ torch.linalg.matrix_power(Linear().free, HORIZON).T).square().sum(1)
+    assert (cost < idle).all()
+    assert (cost > lowest + 0.01).all()
+
+
+# Company
+
+
+@pytest.mark.parametrize("stop_spread", [0.0, 0.6])
+@pytest.mark.parametrize("proposals", [False, True])
+@pytest.mark.parametrize("search", SEARCHES)
+def test_a_plan_is_the_same_alone_among_seven_and_in_any_order(tiny_world, policy, search, proposals, stop_spread):
+    """To the last bit, however long the others search."""
+    proposes = policy if proposals or search == "policy" else None
+    planner = make(search, tiny_world(), policy=proposes, stop_spread=stop_spread)
+    latent, goal, seeds = torch.randn(7, 6), torch.randn(7, 6), torch.tensor([3, 1, 4, 15, 92, 65, 35])
+    together, order = planner.plan(latent, goal, seeds), torch.randperm(7)
+    shuffled = planner.plan(latent[order], goal[order], seeds[order])
+    for key in ("plan", "plan_cost"):
+        assert shuffled[key].equal(together[key][order])
+        for row in torch.arange(7).split(1):
+            assert planner.plan(latent[row], goal[row], seeds[row])[key].equal(together[key][row])
+
+
+@pytest.mark.parametrize("stop_spread", [0.0, 0.6])
+@pytest.mark.parametrize("search", SEARCHES)
+def test_side_by_side_the_plans_are_those_of_one_by_one(tiny_world, policy, monkeypatch, search, stop_spread):
+    """As where there is a GPU: a group is one batch, in which some stop before others."""
+    planner = make(search, tiny_world(), policy=policy, stop_spread=stop_spread, trace=True, iterations=6)
+    generator = torch.Generator().manual_seed(0)
+    latent, goal = torch.randn(2, 7, 6, generator=generator)
+    single = planner.plan(latent, goal)
+    monkeypatch.setattr(LatentPlanner, "_group_size", lambda self, latent: len(latent))
+    grouped = planner.plan(latent, goal)
+    torch.testing.assert_close(grouped["plan"], single["plan"], rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(grouped["plan_cost"], single["plan_cost"], rtol=1e-3, atol=1e-3)
+    if search != "policy":
+        for key, value in single["trace"].items():
+            torch.testing.assert_close(grouped["trace", key], value, rtol=1e-2, atol=1e-3, equal_nan=True)
+    if stop_spread and search in ("cem", "icem"):
+        assert len(single["trace", "spread"].isnan().sum(1).unique()) > 1, "they all stopped together"
+
+
+@pytest.mark.parametrize("size", [1, 3, 7])
+def test_the_memory_budget_changes_no_plan(tiny_world, monkeypatch, size):
+    planner = make("cem", tiny_world())
+    latent, goal = torch.randn(2, 7, 6)
+    expected = planner.plan(latent, goal)
+    monkeypatch.setattr(LatentPlanner, "_group_size", lambda self, latent: size)
+    torch.testing.assert_close(planner.plan(latent, goal)["plan"], expected["plan"], rtol=1e-3, atol=1e-3)
+
+
+# Traces
+
+
+@pytest.mark.parametrize("search", SEARCHING)
+def test_every_iteration_can_be_traced(tiny_world, search):
+    latent, goal = torch.randn(2, 3, 6)
+    result = make(search, tiny_world(), trace=True).plan(latent, goal)
+    plain = make(search, tiny_world()).plan(latent, goal)
+    trace = result["trace"]
+    assert set(trace.keys()) == {"best_cost", "elite_cost", "spread"} and trace.batch_size == (3,)
+    assert all(value.shape == (3, 4) and value.isfinite().all() for value in trace.values())
+    assert (trace["best_cost"] <= trace["elite_cost"]).all()
+    assert set(plain.keys()) == {"plan", "plan_cost"} and plain["plan"].equal(result["plan"])
+
+
+def test_cem_narrows_its_search(quadratic_world, tasks):
+    trace = make("cem", quadratic_world, trace=True, **OPTIMAL["cem"]).plan(*tasks)["trace"]
+    assert (trace["spread"].diff() < 0).float().mean() > 0.9
+    assert (trace["spread"][:, -1] < 0.1 * trace["spread"][:, 0]).all()
+    assert (trace["elite_cost"][:, -1] < trace["elite_cost"][:, 0]).all()
+
+
+@pytest.mark.parametrize("search", ["cem", "icem"])
+def test_an_early_stop_ends_the_search_and_the_trace(quadratic_world, tasks, search):
+    """The plan is that of as many iterations as were run, and what is missing in the trace is NaN."""
+    whole = make(search, quadratic_world, trace=True, iterations=20, num_candidates=100).plan(*tasks)
+    config = {"trace": True, "num_candidates": 100, "stop_spread": 0.1}
+    for row, (latent, goal) in enumerate(zip(*tasks)):
+        seed = torch.tensor([row])
+        result = make(search, quadratic_world, iterations=20, **config).plan(latent[None], goal[None], seed)
+        run = int(result["trace", "spread"].isfinite().sum())
+        assert 1 < run < 20 and result["trace", "spread"][0, run:].isnan().all()
+        torch.testing.assert_close(result["trace", "spread"][0, :run], whole["trace", "spread"][row, :run])
+        assert result["trace", "spread"][0, run - 1] < 0.1
+
+
+# Modes
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode, torch.enable_grad])
+@pytest.mark.parametrize("search", SEARCHES)
+def test_the_gradient_mode_of_the_user_changes_nothing(tiny_world, policy, search, mode):
+    """Latents may come with a graph; the world model is left without gradients."""
+    world = tiny_world()
+    planner = make(search, world, policy=policy)
+    latent, goal = torch.randn(2, 3, 6)
+    expected = planner.plan(latent, goal)["plan"]
+    with mode():
+        seen, wanted = latent * 1, goal * 1
+        if mode is torch.enable_grad:
+            seen, wanted = seen.requires_grad_(), wanted.requires_grad_()
+        result = planner.plan(seen, wanted)
+    assert result["plan"].equal(expected)
+    assert not result["plan"].requires_grad and not result["plan_cost"].requires_grad
+    assert seen.grad is None and all(param.grad is None for param in [*world.parameters(), *policy.parameters()])
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+def test_a_result_may_be_written_into(tiny_world, policy, search):
+    """No tensor of the inference mode inside gets out."""
+    result = make(search, tiny_world(), policy=policy, trace=search != "policy").plan(*torch.randn(2, 3, 6))
+    for value in result.values(True, True):
+        assert not value.is_inference()
+        value.add_(1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("search", ["cem", "gradient"])
+def test_compiled_it_plans_the_same(tiny_world, search):
+    latent, goal = torch.randn(2, 3, 6)
+    plain, compiled = (make(search, tiny_world(), iterations=2, compile=on).plan(latent, goal) for on in (False, True))
+    torch.testing.assert_close(compiled["plan"], plain["plan"], rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(compiled["plan_cost"], plain["plan_cost"], rtol=1e-3, atol=1e-3)
+
+
+# Bad input
+
+
+class Untouched(nn.Module):
+    """A cost that must not be asked."""
+
+    def forward(self, predicted, goal):
+        raise AssertionError("planning began")
+
+
+NAN = torch.full((2, 6), torch.nan)
+
+
+@pytest.mark.parametrize("search", SEARCHING)
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"goal": torch.zeros(2, 5)}, r"goals \[E, 6\].*got \[2, 1, 6\], \[2, 5\]"),
+        ({"goal": torch.zeros(3, 6)}, r"goals \[E, 6\]"),
+        ({"latent": torch.zeros(2, 7)}, r"expected latents \[E, 6\]"),
+        ({"latent": NAN}, "there are latents that are not finite"),
+        ({"goal": NAN / 0}, "there are goals that are not finite"),
+        ({"past_action": torch.zeros(2, 1, 4)}, r"context of 1 frames needs past_action \[2, 0, 4\].*got \[2, 1, 4\]"),
+        ({"latent": torch.zeros(2, 3, 6)}, r"context of 3 frames needs past_action \[2, 2, 4\].*got None"),
+        ({"latent": torch.zeros(2, 2, 6), "past_action": NAN[:, None, :4]}, "past actions that are not finite"),
+        ({"initial": torch.zeros(2, 2, 4)}, r"initial plans \[E, 3, 4\]"),
+        ({"initial": torch.full((2, 3, 4), torch.inf)}, "initial plans that are not finite"),
+    ],
+)
+def test_input_that_makes_no_sense_is_refused_before_planning(tiny_world, search, changes, message):
+    planner = make(search, tiny_world(), cost=Untouched())
+    with pytest.raises(ValueError, match=message):
+        planner.plan(**{"latent": torch.zeros(2, 6), "goal": torch.zeros(2, 6), **changes})
+
+
+@pytest.mark.parametrize("search", ["icem", "mppi", "gradient"])
+def test_settings_of_another_search_are_refused(linear_world, search):
+    kind = SEARCHES[search]
+    with pytest.raises(TypeError, match=f"{kind.__name__} takes a {kind.config_class.__name__}, got a PlanConfig"):
+        kind(linear_world(), PlanConfig(), action_bounds=UNIT)
+    assert make("cem", linear_world()).plan(torch.zeros(1, 2), torch.zeros(1, 2))["plan"].shape == (1, 3, 4)
+    SEARCHES["cem"](linear_world(), ICEMConfig(), action_bounds=UNIT)  # a PlanConfig and more
+
+
+@pytest.mark.parametrize(
+    ("search", "wrong", "message"),
+    [
+        ("icem", {"num_elites": 101}, "between 2 and num_candidates=100, got 101"),
+        ("icem", {"decay": 0.5}, "decay be at least 1"),
+        ("icem", {"momentum": 1.0}, r"momentum lie in \[0, 1\)"),
+        ("icem", {"kept_elites": 1.5}, r"kept_elites lie in \[0, 1\]"),
+        ("icem", {"noise_beta": -1.0}, "noise_beta must not be negative"),
+        ("mppi", {"temperature": 0.0}, "temperature must be positive"),
+        ("mppi", {"min_std": 2.0}, "min_std lie between 0 and std=1.0"),
+        ("gradient", {"learning_rate": 0.0}, "learning_rate must be positive, got 0.0"),
+        ("cem", {"stop_spread": -0.1}, "stop_spread must not be negative"),
+        ("cem", {"history": "two"}, "unknown history 'two'"),
+        ("cem", {"memory_budget": 0.0}, "memory_budget must be positive"),
+    ],
+)
+def test_impossible_settings_are_refused(search, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        SEARCHES[search].config_class(**wrong)
+
+
+def test_policies_that_are_missing_or_of_another_model_are_refused(tiny_world, policy):
+    with pytest.raises(ValueError, match="PolicyPlanner needs a policy="):
+        make("policy", tiny_world())
+    with pytest.raises(ValueError, match="num_proposals above 0"):
+        make("policy", tiny_world(), policy=policy, num_proposals=0)
+    with pytest.raises(ValueError, match="latents of 5 .* train a policy for this model"):
+        make("cem", tiny_world(), policy=GoalPolicy(latent_dim=5, action_dim=4))

@@ -46,10 +46,13 @@ def attend(query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: 
 def _attend_to_few(query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: bool) -> torch.Tensor:
     """As :func:`attend`, token by token: matrix products of a few rows spend their time on copies."""
     keys, values, mixed = key.unbind(2), value.unbind(2), []  # each [N, heads, dim_head]
-    for place, token in enumerate((query * query.shape[-1] ** -0.5).unbind(2)):
+    for place, token in enumerate(query.unbind(2)):
         seen = place + 1 if causal else len(keys)
+        if seen == 1:
+            mixed.append(values[0])
+            continue
         scores = torch.stack([(token * keys[i]).sum(-1, keepdim=True) for i in range(seen)])  # [seen, N, heads, 1]
-        weights = scores.softmax(0)
+        weights = (scores * query.shape[-1] ** -0.5).softmax(0)
         mix = weights[0] * values[0]
         for i in range(1, seen):
             mix = torch.addcmul(mix, weights[i], values[i])
@@ -182,8 +185,14 @@ class AdaptiveBlock(nn.Module):
     ) -> tuple[torch.Tensor, Cache]:
         """As :meth:`forward` without dropout, for new tokens after known ones; see :meth:`Attention.extend`."""
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.chunk(6, dim=-1)  # each [N, T, C]
-        mixed, seen = self.attn.extend(self.attn_norm(self.adaptive_norm(x) * (1 + scale_a) + shift_a), past, last)
+        mixed, seen = self.attn.extend(self.attn_norm(_modulate(self.adaptive_norm(x), shift_a, scale_a)), past, last)
         if last:
             x, gate_a, shift_m, scale_m, gate_m = (t[:, -1:].contiguous() for t in (x, gate_a, shift_m, scale_m, gate_m))
-        x = x + gate_a * mixed
-        return x + gate_m * self.mlp(self.mlp_norm(self.adaptive_norm(x) * (1 + scale_m) + shift_m)), seen
+        x = torch.addcmul(x, gate_a, mixed)
+        hidden = self.mlp(self.mlp_norm(_modulate(self.adaptive_norm(x), shift_m, scale_m)))
+        return torch.addcmul(x, gate_m, hidden), seen
+
+
+def _modulate(x: torch.Tensor, shift: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+    """x (1 + scale) + shift, all [N, T, C], in two passes over memory."""
+    return torch.addcmul(x + shift, x, scale)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -30,7 +31,7 @@ def plan_config(plan: DictConfig) -> PlanConfig:
     """The settings of the search.
 
     Raises:
-        ValueError: an unknown search or cost, or a setting outside its range.
+        ValueError: an unknown search or cost, a setting of another search, or one outside its range.
     """
     values = OmegaConf.to_container(plan)
     search = values.pop("search")
@@ -42,7 +43,11 @@ def plan_config(plan: DictConfig) -> PlanConfig:
     if wrong:
         raise ValueError(f"must not be negative: {', '.join(wrong)}.")
     settings = {key: value for key, value in values.items() if key not in (*COST_FIELDS, "policy")}
-    return SEARCHES[search].config_class(**settings)
+    kind = SEARCHES[search].config_class
+    foreign = sorted(settings.keys() - {field.name for field in fields(kind)})
+    if foreign:
+        raise ValueError(f"plan.search={search} has no {', '.join(foreign)}: choose it by plan={search} instead.")
+    return kind(**settings)
 
 
 def check_horizon(plan: DictConfig, frame_skip: int, budget: int) -> None:
@@ -60,12 +65,13 @@ def check_horizon(plan: DictConfig, frame_skip: int, budget: int) -> None:
 
 def make_cost(plan: DictConfig, inverse_model: InverseDynamicsModel) -> nn.Module:
     """The cost of the ``plan`` group; further terms are weighted relative to the spread of the first."""
-    first = COSTS[plan.get("cost", "goal")]()
+    terms, weights = [COSTS[plan.get("cost", "goal")]()], [1.0]
     effort, consistency = plan.get("effort", 0.0), plan.get("consistency", 0.0)
-    if not effort and not consistency:
-        return first
-    terms = [first, ActionEffort(), InverseConsistency(inverse_model.eval())]
-    return CostSum(terms, [1.0, effort, consistency], scale_free=True)
+    if effort:
+        terms, weights = [*terms, ActionEffort()], [*weights, effort]
+    if consistency:
+        terms, weights = [*terms, InverseConsistency(inverse_model.eval())], [*weights, consistency]
+    return CostSum(terms, weights, scale_free=True) if len(terms) > 1 else terms[0]
 
 
 def make_policy(

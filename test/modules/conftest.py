@@ -75,3 +75,9 @@ def tiny_world() -> Callable[..., LatentWorldModel]:
         return model.eval()
 
     return tiny_world
+
+
+@pytest.fixture(autouse=True)
+def one_by_one(monkeypatch):
+    """Few candidates share calls among environments; one by one, equalities hold to the last bit, as with 257 or more."""
+    monkeypatch.setattr("torchrl_ficreg.modules.planners.common.ROWS_AT_ONCE", 1)

@@ -196,3 +196,16 @@ def test_a_world_model_in_train_mode_is_refused(tiny_world):
     world.predictor.train()
     with pytest.raises(ValueError, match=r"train mode.*call its eval\(\)"):
         planner.plan(torch.zeros(1, 6), torch.zeros(1, 6))
+
+
+@pytest.mark.parametrize(("candidates", "groups"), [(16, [7]), (100, [5, 2]), (257, [1] * 7)])
+def test_few_candidates_share_calls_on_a_cpu(tiny_world, monkeypatch, candidates, groups):
+    """Up to 512 candidates at once, and the same plans up to the float kernels."""
+    planner = LatentCEMPlanner(tiny_world(), PlanConfig(**{**FAST, "num_candidates": candidates}), action_bounds=UNIT)
+    latent, goal = torch.randn(2, 7, 6)
+    alone = planner.plan(latent, goal)
+    monkeypatch.setattr("torchrl_ficreg.modules.planners.common.ROWS_AT_ONCE", 512)
+    sizes, search = [], planner._search
+    monkeypatch.setattr(planner, "_search", lambda problem: (sizes.append(len(problem.goal)), search(problem))[1])
+    torch.testing.assert_close(planner.plan(latent, goal)["plan"], alone["plan"], rtol=1e-3, atol=1e-4)
+    assert sizes == groups

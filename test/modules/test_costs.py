@@ -1,4 +1,4 @@
-"""Claims about costs: each is its formula, a scale-free sum knows no units, and a planner gives a cost what it names."""
+"""Claims about costs: each is its formula, a scale-free sum knows no units, a planner gives a cost what it names."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from torchrl_ficreg import (
 )
 
 UNIT = ([-1.0, -1.0], [1.0, 1.0])
-FAST = {"num_candidates": 32, "num_elites": 6, "iterations": 5, "horizon": 3, "receding_horizon": 1, "precision": "fp32"}
+FAST = {"num_candidates": 32, "num_elites": 6, "iterations": 5, "horizon": 3, "receding_horizon": 1}
+FAST |= {"precision": "fp32"}
 
 
 @pytest.fixture
@@ -140,7 +141,7 @@ class Scaled(nn.Module):
         return self.scale * cost + self.shift
 
 
-@pytest.mark.parametrize(("scale", "shift"), [(100.0, 0.0), (1e-3, 5.0), (7.0, -30.0)])
+@pytest.mark.parametrize(("scale", "shift"), [(100.0, 0.0), (0.01, 1.0), (7.0, -30.0)])
 def test_a_scale_free_sum_prefers_the_same_whatever_the_units(imagined, scale, shift):
     """Differences between candidates, in units of the first term, do not depend on the units of either term."""
 
@@ -159,7 +160,7 @@ def test_a_scale_free_sum_prefers_the_same_whatever_the_units(imagined, scale, s
 
 
 def test_half_the_weight_is_half_the_say(imagined):
-    """The second term's part of a scale-free sum has half the standard deviation of the first, environment by environment."""
+    """In every environment the second term's part has half the standard deviation of the first."""
     predicted, goal, *_ = imagined
     first = GoalDistance()(predicted, goal)
     part = CostSum([GoalDistance(), ActionEffort()], [1.0, 0.5], scale_free=True)(*imagined) - first

@@ -1,4 +1,4 @@
-"""Claims about what a plan starts from: the real frames and executed blocks before it, and the rest of the last plan."""
+"""Claims about what a plan starts from: the real frames and executed blocks before it, the rest of the last plan."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Claims about all searches.
 
 They reach the optimum of a linear-quadratic world, inside the bounds and on them. A plan depends neither on who else is
-planned for nor on whether that happens side by side. Every iteration can be traced. Bad input is refused before anything
-is imagined, and no gradient mode that a user is in changes a plan.
+planned for nor on whether that happens side by side. Every iteration can be traced, and no gradient mode that a user is
+in changes a plan.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from torchrl_ficreg import ActionEffort, CostSum, GoalDistance, GoalPolicy, LatentWorldModel, PlanConfig
-from torchrl_ficreg.modules.planners import ICEMConfig, SEARCHES
-from torchrl_ficreg.modules.planners.common import LatentPlanner
+from torchrl_ficreg import ActionEffort, CostSum, GoalDistance, GoalPolicy, LatentPlanner, LatentWorldModel
+from torchrl_ficreg.modules.planners import SEARCHES
 
 UNIT = ([-1.0, -1.0], [1.0, 1.0])
 EFFORT, HORIZON = 8.0, 4
-SAMPLING = ["cem", "icem", "mppi", "shooting"]
-SEARCHING = [*SAMPLING, "gradient"]
+SEARCHING = [name for name in SEARCHES if name != "policy"]
 OPTIMAL = {
     "cem": {"num_candidates": 400, "num_elites": 40, "iterations": 20},
     "icem": {"num_candidates": 400, "num_elites": 40, "iterations": 20, "noise_beta": 0.5, "decay": 1.05},
     "mppi": {"num_candidates": 400, "num_elites": 80, "iterations": 20, "min_std": 0.01},
     "gradient": {"num_candidates": 4, "num_elites": 2, "iterations": 150, "learning_rate": 0.1},
 }
-FAST = {"num_candidates": 24, "num_elites": 5, "iterations": 4, "horizon": 3, "receding_horizon": 1, "precision": "fp32"}
+FAST = {"num_candidates": 24, "num_elites": 5, "iterations": 4, "num_proposals": 4}
+FAST |= {"horizon": 3, "receding_horizon": 1, "precision": "fp32"}
+STOP = 0.7  # where some of the tiny world's searches stop early and others do not
 
 
 def make(search, world, *, cost=None, policy=None, **settings):
@@ -136,8 +136,7 @@ def test_random_shooting_is_better_than_doing_nothing_and_worse_than_the_optimum
 # Company
 
 
-@pytest.mark.parametrize("stop_spread", [0.0, 0.6])
-@pytest.mark.parametrize("proposals", [False, True])
+@pytest.mark.parametrize(("proposals", "stop_spread"), [(False, 0.0), (True, STOP)])
 @pytest.mark.parametrize("search", SEARCHES)
 def test_a_plan_is_the_same_alone_among_seven_and_in_any_order(tiny_world, policy, search, proposals, stop_spread):
     """To the last bit, however long the others search."""
@@ -152,7 +151,7 @@ def test_a_plan_is_the_same_alone_among_seven_and_in_any_order(tiny_world, polic
             assert planner.plan(latent[row], goal[row], seeds[row])[key].equal(together[key][row])
 
 
-@pytest.mark.parametrize("stop_spread", [0.0, 0.6])
+@pytest.mark.parametrize("stop_spread", [0.0, STOP])
 @pytest.mark.parametrize("search", SEARCHES)
 def test_side_by_side_the_plans_are_those_of_one_by_one(tiny_world, policy, monkeypatch, search, stop_spread):
     """As where there is a GPU: a group is one batch, in which some stop before others."""
@@ -167,7 +166,7 @@ def test_side_by_side_the_plans_are_those_of_one_by_one(tiny_world, policy, monk
     if search != "policy":
         for key, value in single["trace"].items():
             torch.testing.assert_close(grouped["trace", key], value, rtol=1e-2, atol=1e-3, equal_nan=True)
-    if stop_spread and search in ("cem", "icem"):
+    if stop_spread and search not in ("gradient", "policy"):
         assert len(single["trace", "spread"].isnan().sum(1).unique()) > 1, "they all stopped together"
 
 
@@ -246,84 +245,23 @@ def test_a_result_may_be_written_into(tiny_world, policy, search):
         value.add_(1.0)
 
 
+@pytest.mark.parametrize("search", SEARCHING)
+def test_in_bfloat16_it_finds_better_than_standing_still(tiny_world, search):
+    """The cost that it reports is that of the plan, but for rounding."""
+    world, (latent, goal) = tiny_world(), torch.randn(2, 3, 6)
+    result = make(search, world, precision="bf16").plan(latent, goal)
+    with torch.no_grad():
+        idle, cost = (
+            (world.rollout(latent[:, None], plan)[:, -1] - goal).square().sum(-1)
+            for plan in (torch.zeros_like(result["plan"]), result["plan"])
+        )
+    torch.testing.assert_close(result["plan_cost"], cost, rtol=0.1, atol=0.1)
+    assert (cost < idle).all() and result["plan"].dtype == torch.float32
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("search", ["cem", "gradient"])
-def test_compiled_it_plans_the_same(tiny_world, search):
+def test_compiled_it_plans_the_same(tiny_world):
     latent, goal = torch.randn(2, 3, 6)
-    plain, compiled = (make(search, tiny_world(), iterations=2, compile=on).plan(latent, goal) for on in (False, True))
+    plain, compiled = (make("cem", tiny_world(), iterations=2, compile=on).plan(latent, goal) for on in (False, True))
     torch.testing.assert_close(compiled["plan"], plain["plan"], rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(compiled["plan_cost"], plain["plan_cost"], rtol=1e-3, atol=1e-3)
-
-
-# Bad input
-
-
-class Untouched(nn.Module):
-    """A cost that must not be asked."""
-
-    def forward(self, predicted, goal):
-        raise AssertionError("planning began")
-
-
-NAN = torch.full((2, 6), torch.nan)
-
-
-@pytest.mark.parametrize("search", SEARCHING)
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"goal": torch.zeros(2, 5)}, r"goals \[E, 6\].*got \[2, 1, 6\], \[2, 5\]"),
-        ({"goal": torch.zeros(3, 6)}, r"goals \[E, 6\]"),
-        ({"latent": torch.zeros(2, 7)}, r"expected latents \[E, 6\]"),
-        ({"latent": NAN}, "there are latents that are not finite"),
-        ({"goal": NAN / 0}, "there are goals that are not finite"),
-        ({"past_action": torch.zeros(2, 1, 4)}, r"context of 1 frames needs past_action \[2, 0, 4\].*got \[2, 1, 4\]"),
-        ({"latent": torch.zeros(2, 3, 6)}, r"context of 3 frames needs past_action \[2, 2, 4\].*got None"),
-        ({"latent": torch.zeros(2, 2, 6), "past_action": NAN[:, None, :4]}, "past actions that are not finite"),
-        ({"initial": torch.zeros(2, 2, 4)}, r"initial plans \[E, 3, 4\]"),
-        ({"initial": torch.full((2, 3, 4), torch.inf)}, "initial plans that are not finite"),
-    ],
-)
-def test_input_that_makes_no_sense_is_refused_before_planning(tiny_world, search, changes, message):
-    planner = make(search, tiny_world(), cost=Untouched())
-    with pytest.raises(ValueError, match=message):
-        planner.plan(**{"latent": torch.zeros(2, 6), "goal": torch.zeros(2, 6), **changes})
-
-
-@pytest.mark.parametrize("search", ["icem", "mppi", "gradient"])
-def test_settings_of_another_search_are_refused(linear_world, search):
-    kind = SEARCHES[search]
-    with pytest.raises(TypeError, match=f"{kind.__name__} takes a {kind.config_class.__name__}, got a PlanConfig"):
-        kind(linear_world(), PlanConfig(), action_bounds=UNIT)
-    assert make("cem", linear_world()).plan(torch.zeros(1, 2), torch.zeros(1, 2))["plan"].shape == (1, 3, 4)
-    SEARCHES["cem"](linear_world(), ICEMConfig(), action_bounds=UNIT)  # a PlanConfig and more
-
-
-@pytest.mark.parametrize(
-    ("search", "wrong", "message"),
-    [
-        ("icem", {"num_elites": 101}, "between 2 and num_candidates=100, got 101"),
-        ("icem", {"decay": 0.5}, "decay be at least 1"),
-        ("icem", {"momentum": 1.0}, r"momentum lie in \[0, 1\)"),
-        ("icem", {"kept_elites": 1.5}, r"kept_elites lie in \[0, 1\]"),
-        ("icem", {"noise_beta": -1.0}, "noise_beta must not be negative"),
-        ("mppi", {"temperature": 0.0}, "temperature must be positive"),
-        ("mppi", {"min_std": 2.0}, "min_std lie between 0 and std=1.0"),
-        ("gradient", {"learning_rate": 0.0}, "learning_rate must be positive, got 0.0"),
-        ("cem", {"stop_spread": -0.1}, "stop_spread must not be negative"),
-        ("cem", {"history": "two"}, "unknown history 'two'"),
-        ("cem", {"memory_budget": 0.0}, "memory_budget must be positive"),
-    ],
-)
-def test_impossible_settings_are_refused(search, wrong, message):
-    with pytest.raises(ValueError, match=message):
-        SEARCHES[search].config_class(**wrong)
-
-
-def test_policies_that_are_missing_or_of_another_model_are_refused(tiny_world, policy):
-    with pytest.raises(ValueError, match="PolicyPlanner needs a policy="):
-        make("policy", tiny_world())
-    with pytest.raises(ValueError, match="num_proposals above 0"):
-        make("policy", tiny_world(), policy=policy, num_proposals=0)
-    with pytest.raises(ValueError, match="latents of 5 .* train a policy for this model"):
-        make("cem", tiny_world(), policy=GoalPolicy(latent_dim=5, action_dim=4))

@@ -37,14 +37,12 @@ class PixelNormalizer(nn.Module):
                 f"pixels must be [..., {size[0]}, {size[1]}, {size[2]}] (channels first), got {list(pixels.shape)}: "
                 "permute the channels, or build the encoder with another image_size."
             )
-        if pixels.dtype == torch.uint8:
-            scale = self.scale / 255
-        elif pixels.is_floating_point():
-            scale = self.scale
-        else:
-            raise TypeError(f"pixels must be uint8 (0..255) or floating (0..1), got {pixels.dtype}: convert them.")
         frames = pixels.flatten(0, -4) if pixels.ndim > 3 else pixels[None]  # [N, 3, H, W]
-        return frames.to(scale.dtype) * scale + self.shift
+        if pixels.dtype == torch.uint8:
+            return frames.to(self.scale.dtype).mul_(self.scale / 255).add_(self.shift)  # a copy, free to be overwritten
+        if pixels.is_floating_point():
+            return frames.to(self.scale.dtype) * self.scale + self.shift
+        raise TypeError(f"pixels must be uint8 (0..255) or floating (0..1), got {pixels.dtype}: convert them.")
 
 
 def restore_lead(latent: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:

@@ -130,11 +130,6 @@ class CausalTransformer(nn.Module):
             [N, S, D].
         """
         context = latent.shape[-2]
-        if self.history == 1:
-            steps = [latent[:, -1:]]  # [N, 1, D] each
-            for block in action[:, context - 1 :].split(1, dim=-2):
-                steps.append(self(steps[-1], block))
-            return torch.cat(steps[1:], dim=-2)
         modulation = self.modulation(action)
         window = list(latent.unbind(-2))  # C + S latents in the end, each [N, D]
         seen, first = None, max(0, context - self.history)  # oldest token of the window
@@ -144,21 +139,27 @@ class CausalTransformer(nn.Module):
             known = 0 if seen is None else seen[0][0].shape[-2]  # tokens of the window computed before
             new = torch.stack(window[first + known : end], dim=-2)  # [N, T, D]
             ahead = [layer[:, first + known : end] for layer in modulation]
-            predicted, seen = self._extend(new, ahead, seen, known)
+            grows = end - first < self.history and end < action.shape[-2]
+            predicted, seen = self._extend(new, ahead, seen, known, grows)
             window.append(predicted)
         return torch.stack(window[context:], dim=-2)
 
     def _extend(
-        self, latent: torch.Tensor, modulation: list[torch.Tensor], past: list[Cache] | None, position: int
-    ) -> tuple[torch.Tensor, list[Cache]]:
+        self,
+        latent: torch.Tensor,
+        modulation: list[torch.Tensor],
+        past: list[Cache] | None,
+        position: int,
+        keep: bool,
+    ) -> tuple[torch.Tensor, list[Cache] | None]:
         """New latents [N, T, D] from a position on, and what is kept of those before -> the next latent [N, D]."""
         tokens = self.to_width(latent) + self.position[:, position : position + latent.shape[-2]]  # [N, T, width]
         seen = []
         for depth, (block, ahead) in enumerate(zip(self.blocks, modulation)):
             last = depth == len(self.blocks) - 1
-            tokens, cache = block.extend(tokens, ahead, past[depth] if past else None, last)
+            tokens, cache = block.extend(tokens, ahead, past[depth] if past else None, last=last, keep=keep)
             seen.append(cache)
-        return self.projector(self.norm(tokens))[:, -1], seen
+        return self.projector(self.norm(tokens))[:, -1], seen if keep else None
 
     def forward(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Latents [..., T, D] and the action blocks that lead on from them [..., T, F * A] -> [..., T, D].

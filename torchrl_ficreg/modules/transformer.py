@@ -10,6 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from torchrl_ficreg.modules.kernels import linear, Linear, packed_attention, trains_on_cpu
+
 Cache = tuple[torch.Tensor, torch.Tensor]  # keys and values, each [N, heads, T, dim_head]
 
 
@@ -77,8 +79,8 @@ class Attention(nn.Module):
         super().__init__()
         self.heads, self.causal = heads, causal
         self.inner = heads * dim_head
-        self.to_qkv = nn.Linear(dim, 3 * self.inner, bias=qkv_bias)
-        self.to_out = nn.Linear(self.inner, dim)
+        self.to_qkv = Linear(dim, 3 * self.inner, bias=qkv_bias)
+        self.to_out = Linear(self.inner, dim)
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -88,35 +90,52 @@ class Attention(nn.Module):
             bias = self.to_qkv.bias[2 * self.inner :] if self.to_qkv.bias is not None else None
             mixed = F.linear(x, self.to_qkv.weight[2 * self.inner :], bias)  # [N, 1, inner]
         else:
-            query, key, value = self._heads(self.to_qkv(x), 3).unbind(0)
-            mixed = attend(query, key, value, self.causal).transpose(1, 2).flatten(2)  # [N, T, inner]
+            packed = self.to_qkv(x)  # [N, T, 3 * inner]
+            if trains_on_cpu(packed) and not self.causal:
+                mixed = packed_attention(packed, self.heads)
+            else:
+                mixed = attend(*self._heads(packed, 3).unbind(0), self.causal).transpose(1, 2).flatten(2)
+        return self.dropout(self.to_out(mixed))  # of [N, T, inner]
+
+    def first(self, x: torch.Tensor) -> torch.Tensor:
+        """The first token of :meth:`forward` alone, where it sees all others: [N, T, C] -> [N, 1, C]."""
+        mixed = attend(*self._one_query(x, 0), False).transpose(1, 2).flatten(2)  # [N, 1, inner]
         return self.dropout(self.to_out(mixed))
 
-    def extend(self, x: torch.Tensor, past: Cache | None, last: bool) -> tuple[torch.Tensor, Cache]:
+    def extend(
+        self, x: torch.Tensor, past: Cache | None, *, last: bool, keep: bool
+    ) -> tuple[torch.Tensor, Cache | None]:
         """Causal attention of new tokens whose predecessors' keys and values are known; no dropout.
 
         Args:
             x: [N, T, C]; T = 1 if there is a past.
             past: keys and values of the P earlier tokens, each [N, heads, P, dim_head].
             last: return the last token alone, at the cost of one token.
+            keep: return the keys and values for a next call.
 
         Returns:
-            [N, T, C], or [N, 1, C] if ``last``, and the keys and values of all P + T tokens.
+            [N, T, C], or [N, 1, C] if ``last``, and the keys and values of all P + T tokens, or None.
         """
+        if past is None and not keep and x.shape[-2] == 1:
+            return self.forward(x), None
         if last and x.shape[-2] > 1:
-            weight, bias = self.to_qkv.weight, self.to_qkv.bias
-            split = (None, None) if bias is None else (bias[: self.inner], bias[self.inner :])
-            newest = x[:, -1].contiguous()  # [N, C]; of a strided 3-D input, torch multiplies row by row
-            query = self._heads(F.linear(newest, weight[: self.inner], split[0]).unsqueeze(1), 1)
-            key, value = self._heads(F.linear(x, weight[self.inner :], split[1]), 2).unbind(0)
-            query = query[0]
+            query, key, value = self._one_query(x, -1)
         else:
             query, key, value = self._heads(self.to_qkv(x), 3).unbind(0)
         if past is not None:
             key, value = torch.cat([past[0], key], dim=-2), torch.cat([past[1], value], dim=-2)
         causal = query.shape[-2] > 1
         mixed = attend(query, key, value, causal).transpose(1, 2).flatten(2)  # [N, Q, inner]
-        return self.to_out(mixed), (key, value)
+        return self.to_out(mixed), (key, value) if keep else None
+
+    def _one_query(self, x: torch.Tensor, place: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """The query of one token [N, heads, 1, dim_head], and keys and values of all T."""
+        weight, bias = self.to_qkv.weight, self.to_qkv.bias
+        split = (None, None) if bias is None else (bias[: self.inner], bias[self.inner :])
+        token = x[:, place].contiguous()  # [N, C]; of a strided 3-D input, torch multiplies row by row
+        query = self._heads(F.linear(token, weight[: self.inner], split[0]).unsqueeze(1), 1)
+        key, value = self._heads(linear(x, weight[self.inner :], split[1]), 2).unbind(0)
+        return query[0], key, value
 
     def _heads(self, x: torch.Tensor, parts: int) -> torch.Tensor:
         """[N, T, parts * inner] -> [parts, N, heads, T, dim_head]."""
@@ -128,7 +147,7 @@ class FeedForward(nn.Sequential):
 
     def __init__(self, dim: int, hidden: int, dropout: float = 0.0) -> None:
         super().__init__(
-            nn.Linear(dim, hidden), nn.GELU(), nn.Dropout(dropout), nn.Linear(hidden, dim), nn.Dropout(dropout)
+            Linear(dim, hidden), nn.GELU(), nn.Dropout(dropout), Linear(hidden, dim), nn.Dropout(dropout)
         )
 
 
@@ -144,8 +163,14 @@ class Block(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """[N, T, C] -> [N, T, C]."""
-        x = x + self.attn(self.attn_norm(x))
-        return x + self.mlp(self.mlp_norm(x))
+        # The branches are widened first under autocast: torch adds tensors of two dtypes at half the speed.
+        x = x + self.attn(self.attn_norm(x)).to(x.dtype)
+        return x + self.mlp(self.mlp_norm(x)).to(x.dtype)
+
+    def first(self, x: torch.Tensor) -> torch.Tensor:
+        """The first token of :meth:`forward` alone, where it sees all others: [N, T, C] -> [N, 1, C]."""
+        token = x[:, :1] + self.attn.first(self.attn_norm(x))
+        return token + self.mlp(self.mlp_norm(token))
 
 
 class AdaptiveBlock(nn.Module):
@@ -181,12 +206,13 @@ class AdaptiveBlock(nn.Module):
         return x + gate_m * self.mlp(self.mlp_norm(self.adaptive_norm(x) * (1 + scale_m) + shift_m))
 
     def extend(
-        self, x: torch.Tensor, modulation: torch.Tensor, past: Cache | None, last: bool
-    ) -> tuple[torch.Tensor, Cache]:
+        self, x: torch.Tensor, modulation: torch.Tensor, past: Cache | None, *, last: bool, keep: bool
+    ) -> tuple[torch.Tensor, Cache | None]:
         """As :meth:`forward` without dropout, for new tokens after known ones; see :meth:`Attention.extend`."""
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.chunk(6, dim=-1)  # each [N, T, C]
-        mixed, seen = self.attn.extend(self.attn_norm(_modulate(self.adaptive_norm(x), shift_a, scale_a)), past, last)
-        if last:
+        hidden = self.attn_norm(_modulate(self.adaptive_norm(x), shift_a, scale_a))
+        mixed, seen = self.attn.extend(hidden, past, last=last, keep=keep)
+        if last and x.shape[-2] > 1:
             x, gate_a, shift_m, scale_m, gate_m = (t[:, -1:].contiguous() for t in (x, gate_a, shift_m, scale_m, gate_m))
         x = torch.addcmul(x, gate_a, mixed)
         hidden = self.mlp(self.mlp_norm(_modulate(self.adaptive_norm(x), shift_m, scale_m)))

@@ -8,6 +8,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 
 from torchrl_ficreg.data.schema import LATENT, PIXELS
+from torchrl_ficreg.modules.kernels import Linear
 from torchrl_ficreg.modules.pixels import PixelNormalizer, restore_lead
 from torchrl_ficreg.modules.projector import Projector
 from torchrl_ficreg.modules.transformer import Block
@@ -41,7 +42,7 @@ class VisionTransformer(nn.Module):
         self.patch_size = patch_size
         num_patches = (image_size // patch_size) ** 2
         self.normalize = PixelNormalizer(image_size)
-        self.to_patch = nn.Linear(3 * patch_size**2, width)
+        self.to_patch = Linear(3 * patch_size**2, width)
         self.class_token = nn.Parameter(torch.empty(1, 1, width))
         self.position = nn.Parameter(torch.empty(1, num_patches + 1, width))
         self.blocks = nn.ModuleList(Block(width, heads, mlp_dim) for _ in range(depth))
@@ -60,9 +61,10 @@ class VisionTransformer(nn.Module):
         patches = frames.unfold(2, self.patch_size, self.patch_size).unfold(3, self.patch_size, self.patch_size)
         tokens = self.to_patch(patches.permute(0, 2, 3, 1, 4, 5).flatten(3).flatten(1, 2))  # [N, P, width]
         tokens = torch.cat([self.class_token.expand(len(tokens), -1, -1), tokens], dim=1) + self.position
-        for block in self.blocks:
+        for block in self.blocks[:-1]:
             tokens = block(tokens)  # [N, P + 1, width]
-        return restore_lead(self.projector(self.norm(tokens[:, 0])), pixels)
+        token = self.blocks[-1].first(tokens)[:, 0]  # [N, width]; of the last layer nothing else is read
+        return restore_lead(self.projector(self.norm(token)), pixels)
 
 
 class ViTEncoder(TensorDictModule):

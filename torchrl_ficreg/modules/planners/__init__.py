@@ -1,5 +1,7 @@
 """Search for action sequences in latent space: dynamics x cost x search."""
 
+from __future__ import annotations
+
 from torchrl_ficreg.modules.planners.cem import LatentCEMPlanner
 from torchrl_ficreg.modules.planners.common import LatentPlanner
 from torchrl_ficreg.modules.planners.config import GradientConfig, ICEMConfig, MPPIConfig, PlanConfig

@@ -14,6 +14,7 @@ from torchrl.modules.planners import MPCPlannerBase
 
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.goal_policy import GoalPolicy
+from torchrl_ficreg.modules.memory import keep_freed_memory
 from torchrl_ficreg.modules.planners.config import PlanConfig
 from torchrl_ficreg.modules.planners.costs import Cost, GoalDistance, wanted_by
 from torchrl_ficreg.modules.planners.dynamics import FastDynamics
@@ -21,6 +22,7 @@ from torchrl_ficreg.modules.planners.problem import make_generator, Problem
 from torchrl_ficreg.modules.precision import autocast, uses_bf16
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
+ROWS_AT_ONCE = 512  # candidates that keep the cores of a CPU busy
 PLAN, PLAN_COST, PLAN_SEED, PAST_ACTION, TRACE = "plan", "plan_cost", "plan_seed", "past_action", "trace"
 
 
@@ -33,9 +35,9 @@ class LatentPlanner(MPCPlannerBase):
     [E, horizon, F * A] z-scored, its predicted ``plan_cost`` [E] and, as TorchRL's planners do, the first block as
     ``action`` [E, F * A]; with ``config.trace`` also the ``trace`` of every iteration.
 
-    Every environment draws from a generator of its own. On CPUs the search runs environment by environment as well
-    (300 candidates fill the cores), so there a plan is the same to the last bit alone or among fifty; elsewhere the
-    same up to the float kernels.
+    Every environment draws from a generator of its own, so its plan is the same alone or among fifty, up to the float
+    kernels: environments are imagined in groups, on CPUs of 512 candidates in all. With 257 candidates or more, that is
+    environment by environment, and a plan on a CPU is the same to the last bit in any company.
 
     Args:
         world_model: the dynamics; put it into ``eval()`` first.
@@ -165,6 +167,8 @@ class LatentPlanner(MPCPlannerBase):
         first = max(0, latent.shape[1] - self.context)
         latent, past_action = latent[:, first:], past_action[:, first:]
         group = self._group_size(latent)
+        if latent.device.type == "cpu":
+            keep_freed_memory()
         fast = uses_bf16(latent.device, self.config.precision)
         dynamics = self._fast.of(self.world_model) if fast else self.world_model
         with torch.inference_mode(not self.needs_gradient), torch.no_grad():
@@ -205,7 +209,7 @@ class LatentPlanner(MPCPlannerBase):
     def _group_size(self, latent: torch.Tensor) -> int:
         """Environments planned for side by side."""
         if latent.device.type == "cpu":
-            return 1
+            return max(1, ROWS_AT_ONCE // self.config.num_candidates)
         width = sum(layer.out_features for layer in self.world_model.predictor.modules() if isinstance(layer, nn.Linear))
         rows = self.config.num_candidates * (self.config.horizon + latent.shape[1] - 1)
         return max(1, int(self.config.memory_budget * 2**30 / (4 * rows * max(1, width))))

@@ -67,7 +67,7 @@ class SamplingPlanner(LatentPlanner):
             if config.stop_spread > 0 and done.all():
                 break
         plan = self._choose(mean, elites)
-        result = {PLAN: plan, PLAN_COST: problem.cost(plan.unsqueeze(1))[:, 0]}
+        result = {PLAN: plan, PLAN_COST: problem.cost(plan.unsqueeze(1))[:, 0].clone()}
         if config.trace:
             result[TRACE] = _as_table(trace, config.iterations)
         return TensorDict(result, [len(plan)])

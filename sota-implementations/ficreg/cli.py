@@ -18,6 +18,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
+from torchrl_ficreg.trainers import exit_on_signal, Preempted
+
 INTERRUPTED = "interrupted: the same command continues where it stopped."
 CONFIG_DIR = Path(__file__).resolve().parent / "config"
 
@@ -40,7 +42,12 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
     def decorate(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         def run(config: DictConfig) -> None:
             try:
-                main(config)
+                with exit_on_signal():
+                    main(config)
+            except Preempted as stop:
+                _close_bars()
+                print(stop, file=sys.stderr)
+                raise
             except KeyboardInterrupt:
                 _close_bars()
                 sys.exit(INTERRUPTED)
@@ -87,7 +94,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
     known = [*sorted(groups), *(path for path, _ in _leaves(declared))]
     for override in overrides:
         key = override.key_or_group
-        if key in groups or key.startswith("hydra."):
+        if key in groups or key.startswith(("hydra.", "hydra/")):  # Hydra checks its own
             continue
         if override.is_add() or override.is_delete() or not _declares(declared, key):
             near = difflib.get_close_matches(key, known, n=1, cutoff=0.3)

@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from sharded import record_shards
 from tqdm import tqdm
 
-from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, estimate_bytes, OfflineTrajectories
+from torchrl_ficreg.data import EpisodeWriter, estimate_bytes, OfflineTrajectories
+from torchrl_ficreg.data.shards import open_store, shard_paths
 from torchrl_ficreg.data.space import require_space
 from torchrl_ficreg.envs import collect_episodes, make_env
 
@@ -27,7 +29,7 @@ def find_dataset(cfg: DictConfig) -> Path:
     """
     if cfg.dataset is None:
         return collect_dataset(cfg)
-    store = EpisodeStore.open(Path(cfg.dataset))
+    store = open_store(Path(cfg.dataset))
     env, size = store.header.meta.get("env"), store.header.shapes["pixels"][-1]
     if env != cfg.env.name:
         raise ValueError(f"the episodes of dataset={cfg.dataset} are of {env}: give env={env}.")
@@ -55,6 +57,8 @@ def collect_dataset(cfg: DictConfig) -> Path:
         "action_low": low,
         "action_high": high,
     }
+    if cfg.collect.collector is not None or shard_paths(path):
+        return record_shards(cfg, path, meta)
     # Several runs may be started at once: one of them records, the others wait for it.
     frames = cfg.collect.frames
     with EpisodeWriter(path, target_episodes=data.episodes, meta=meta, frames=frames, wait=True) as writer:

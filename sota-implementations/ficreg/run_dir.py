@@ -5,15 +5,42 @@ from __future__ import annotations
 import fcntl
 import os
 from pathlib import Path
+from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from torchrl.checkpoint import CheckpointRotation
 from utils import flatten, write_text
 
-from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS
+from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, find_checkpoint, read_card
 from torchrl_ficreg.trainers.offline import METRICS
 
+README = "README.txt"
+_README = """{name}: a run of train.py, begun or continued by
+
+    python train.py {overrides}
+
+The same command continues it after a stop of any kind (SIGTERM: it writes a checkpoint and exits with code 85), and
+evaluates it again once it has finished. Without training, with other settings of the evaluation:
+
+    python evaluate.py checkpoint={run_dir}
+
+checkpoints/          the latest two, and the best where evaluation.every was set: weights, optimiser, schedule, random
+                      state, position in the data, action statistics and configuration; torchrl.checkpoint opens them,
+                      torchrl_ficreg.trainers.load_world_model makes a model of them
+config.yaml           every setting, resolved
+metrics.csv           losses, gradient norms, health of the latents, speed and memory; a row every few steps, and one of
+                      held-out clips after every epoch
+pairs.json            starts and goals of the evaluation
+results.json          success rates with their intervals, what training took, versions of the packages
+episodes.gif          rollouts of the planner
+learning_curve.png    losses against steps
+latent_distance.png   distance in latent space against true distance
+wandb/, tensorboard/  files of the logger, where one was asked for
+"""
+
 # Settings that change neither the weights nor how they are reached; a finished run may be given others.
-_FREE = ("collect.", "device", "evaluation.", "plan.", "logger.")
+_FREE = ("collect.", "distributed.", "device", "evaluation.", "plan.", "logger.", "resume")
 _FREE += ("env.budget", "env.goal_offset", "env.num_workers", "env.state_unit")
 
 
@@ -21,22 +48,53 @@ def check_run_dir(cfg: DictConfig) -> Path:
     """The run's folder, which belongs to one configuration as soon as that one has trained. Writes nothing.
 
     Raises:
-        ValueError: it holds a run of another configuration.
+        ValueError: it holds a run of another configuration, or any run under ``resume=never``.
     """
     run_dir, ours = Path(cfg.runs_dir) / cfg.name, OmegaConf.to_container(cfg, resolve=True)
     path = run_dir / "config.yaml"
     if path.exists() and ((run_dir / METRICS).exists() or (run_dir / CHECKPOINTS).exists()):
         theirs = OmegaConf.to_container(OmegaConf.load(path))
+        if cfg.resume == "never":
+            raise ValueError(f"{run_dir} holds a run and resume=never: give another name=..., or resume=auto.")
         if not isinstance(theirs, dict) or "model" not in theirs:
             raise ValueError(f"{path} is damaged: restore it, or give another name=...")
         for config in (ours, theirs):  # a project may be moved, or started from another folder
             config["data_dir"], config["runs_dir"] = (str(Path(config[key]).resolve()) for key in ("data_dir", "runs_dir"))
-        ours, theirs = flatten(ours), flatten(theirs)
-        differ = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key) and not key.startswith(_FREE)]
-        if differ:
-            what = ", ".join(f"{key}: {theirs.get(key)} -> {ours.get(key)}" for key in differ[:3])
+        if what := _differences(ours, theirs):
             raise ValueError(f"{run_dir} holds a run of another configuration ({what}): give another name=...")
     return run_dir
+
+
+def _differences(ours: dict[str, Any], theirs: dict[str, Any], free: tuple[str, ...] = ()) -> str:
+    """The first settings that differ, in words; empty where none of weight does."""
+    ours, theirs = flatten(ours), flatten(theirs)
+    keys = [key for key in sorted(ours | theirs) if not key.startswith((*_FREE, *free))]
+    differ = [key for key in keys if ours.get(key) != theirs.get(key)]
+    return ", ".join(f"{key}: {theirs.get(key)} -> {ours.get(key)}" for key in differ[:3])
+
+
+def find_start(cfg: DictConfig, run_dir: Path) -> Path | None:
+    """The checkpoint that ``resume=<path>`` names, from which a run without any of its own begins; else None.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is an earlier one of this very run, or was made with other settings.
+    """
+    if cfg.resume in ("auto", "never"):
+        return None
+    start = find_checkpoint(cfg.resume)
+    own = run_dir / CHECKPOINTS
+    latest = CheckpointRotation(own, keep_last=1).latest()
+    if latest is not None:
+        if start.resolve().parent == own.resolve() and start.name != latest.name:
+            raise ValueError(f"{own} holds later checkpoints than {start.name}: move those away, and resume=auto takes it.")
+        return None
+    what = _differences(
+        OmegaConf.to_container(cfg, resolve=True), read_card(start).config, free=("name", "data_dir", "runs_dir")
+    )
+    if what:
+        raise ValueError(f"{start} was made with other settings ({what}): repeat them.")
+    return start
 
 
 def claim_run_dir(cfg: DictConfig) -> Path:
@@ -53,4 +111,6 @@ def claim_run_dir(cfg: DictConfig) -> Path:
     except BlockingIOError as error:
         raise RuntimeError(f"another process is at work in {run_dir}: wait for it, or give another name=...") from error
     write_text(run_dir / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
+    overrides = " ".join(HydraConfig.get().overrides.task) if HydraConfig.initialized() else f"name={cfg.name} ..."
+    write_text(run_dir / README, _README.format(name=cfg.name, overrides=overrides, run_dir=f"{cfg.runs_dir}/{cfg.name}"))
     return run_dir

@@ -3,8 +3,13 @@
     python train.py                             FICReg on TwoRoom, minutes on two cores
     python train.py method=lewm                 the same without FICReg's two terms
     python train.py seed=1 optim.epochs=4 name=short
+    torchrun --nproc-per-node=8 train.py        on eight devices, with the numbers of one
 
-An interrupted run continues when the same command is given again.
+Under torchrun optim.batch_size stays the number of clips of a step over all processes. They train together; the first
+one writes all files and, when the others have ended, evaluates.
+
+An interrupted run continues when the same command is given again: after a crash or a kill from the last checkpoint,
+after SIGTERM (exit code 85) from the step it had reached.
 """
 
 from __future__ import annotations
@@ -14,9 +19,10 @@ from pathlib import Path
 import torch
 from cli import entry_point
 from episodes import find_dataset, make_dataset
+from loggers import make_logger, publish
 from omegaconf import DictConfig
 from planning import make_policy
-from run_dir import check_run_dir, claim_run_dir
+from run_dir import check_run_dir, claim_run_dir, find_start
 from utils import (
     add_hooks,
     check_settings,
@@ -24,7 +30,6 @@ from utils import (
     evaluate_beside_random,
     get_device,
     make_card,
-    make_logger,
     make_loss,
     model_config,
     report,
@@ -35,6 +40,7 @@ from utils import (
 from torchrl_ficreg import InverseDynamicsModel, LatentWorldModel, make_world_model
 from torchrl_ficreg.data.latents import encode_episodes, LatentClips
 from torchrl_ficreg.evaluation import (
+    evaluate_mpc,
     latent_distance,
     plot_latent_distance,
     plot_learning_curve,
@@ -48,55 +54,77 @@ from torchrl_ficreg.trainers import (
     OfflineTrainer,
     on_frozen_latents,
     Refinement,
+    stop_on_signal,
+    SuccessRate,
+    TolerantLogger,
 )
+from torchrl_ficreg.trainers.distributed import is_main, process_group, rank, world_size
 from torchrl_ficreg.trainers.offline import METRICS
+from torchrl_ficreg.trainers.parallel import check_processes
 
 
 @entry_point("train")
 def main(cfg: DictConfig) -> None:
     """Data, training, evaluation, report."""
     check_settings(cfg)
-    check_run_dir(cfg)
-    data = find_dataset(cfg)
+    check_processes(cfg.distributed.strategy, cfg.optim.batch_size)
+    run_dir = check_run_dir(cfg)
+    start = find_start(cfg, run_dir)
+    data = find_dataset(cfg)  # of several processes one records, and the others wait for its lock
+    if not is_main():
+        train(cfg, data, run_dir, None, start)
+        return
     pairs = draw_pairs(cfg, data)  # before training: too few episodes shall not come to light after it
-    run_dir = claim_run_dir(cfg)
-    model, inverse_model, card, training = train(cfg, data, run_dir)
+    claim_run_dir(cfg)
+    logger = make_logger(cfg, run_dir)
+    model, inverse_model, card, training = train(cfg, data, run_dir, logger, start)
     outcome = evaluate(cfg, data, run_dir, model, inverse_model, card, pairs)
     results = {**outcome, "training": training, "versions": versions()}
     write_json(run_dir / "results.json", results)
+    publish(logger, results, (cfg.method.name, "random"), run_dir)
     report(results, (cfg.method.name, "random"), run_dir)
 
 
 def train(
-    cfg: DictConfig, data: Path, run_dir: Path
+    cfg: DictConfig, data: Path, run_dir: Path, logger: TolerantLogger | None = None, start: Path | None = None
 ) -> tuple[LatentWorldModel, InverseDynamicsModel, ModelCard, dict]:
-    """Trains, or continues, and returns the networks in eval mode."""
-    torch.manual_seed(cfg.seed)
-    clips = make_dataset(cfg, data, "train", prefetch=1)
-    held_out = make_dataset(cfg, data, "validation", drop_last=False)
-    card = make_card(cfg, clips)
-    model, inverse_model = make_world_model(model_config(cfg), card.action_dim)
-    model.statistics = clips.statistics
-    device = get_device(cfg.device)
-    loss = make_loss(cfg, model.to(device), inverse_model.to(device))
-    refinement = Refinement(seed=cfg.seed, precision=cfg.optim.precision, **cfg.refine)
-    trainer = OfflineTrainer(
-        loss,
-        clips,
-        run_dir=run_dir,
-        validation_buffer=held_out,
-        components={**checkpoint_components(model, inverse_model, card), "refinement": refinement},
-        log_interval=cfg.logger.interval,
-        logger=make_logger(cfg, run_dir),
-        **{key: value for key, value in cfg.optim.items() if key != "batch_size"},
-    )
-    add_hooks(cfg, trainer)
-    resumed_at = trainer.step if trainer.resume() else 0
-    if 0 < resumed_at < trainer.total_steps:
-        print(f"continuing {run_dir} after step {resumed_at} of {trainer.total_steps}")
-    trainer.train()
-    if not refinement.done:
+    """Trains, or continues, and returns the networks in eval mode. Processes part before anything else is done."""
+    with process_group(get_device(cfg.device)) as device:
+        torch.manual_seed(cfg.seed)
+        clips = make_dataset(cfg, data, "train", prefetch=1, part=(rank(), world_size()))
+        held_out = make_dataset(cfg, data, "validation", drop_last=False, part=(rank(), world_size()))
+        card = make_card(cfg, clips)
+        model, inverse_model = make_world_model(model_config(cfg), card.action_dim)
+        model.statistics = clips.statistics
+        loss = make_loss(cfg, model.to(device), inverse_model.to(device))
+        refinement = Refinement(seed=cfg.seed, precision=cfg.optim.precision, **cfg.refine)
+        trainer = OfflineTrainer(
+            loss,
+            clips,
+            run_dir=run_dir,
+            validation_buffer=held_out,
+            components={**checkpoint_components(model, inverse_model, card), "refinement": refinement},
+            log_interval=cfg.logger.interval,
+            logger=logger,
+            strategy=cfg.distributed.strategy,
+            **{key: value for key, value in cfg.optim.items() if key != "batch_size"},
+        )
+        add_hooks(cfg, trainer)
+        success = SuccessRate(
+            lambda: measure_success(cfg, data, run_dir, model, inverse_model, card),
+            max(1, cfg.evaluation.every) * trainer.steps_per_epoch,
+            trainer.metrics_table,
+        )
+        if cfg.evaluation.every and is_main():
+            success.register(trainer)
+        resumed_at = trainer.step if trainer.resume(start) else 0
+        if 0 < resumed_at < trainer.total_steps and is_main():
+            print(f"continuing {run_dir} after step {resumed_at} of {trainer.total_steps}")
+        with stop_on_signal(trainer):
+            trainer.train()
+    if not refinement.done and is_main():
         refine(cfg, data, model, inverse_model, refinement)
+        success.forget()
         trainer.save_trainer(force_save=True)
     training = {
         "steps": trainer.step,
@@ -119,6 +147,30 @@ def refine(
     latent = encode_episodes(clips, encoder_of(model.eval(), cfg.optim.precision), description="encode")
     loss = make_loss(cfg, on_frozen_latents(model), inverse_model, sigreg=NoRegularizer())
     refinement.run(loss, LatentClips(clips, latent))
+
+
+def measure_success(
+    cfg: DictConfig,
+    data: Path,
+    run_dir: Path,
+    model: LatentWorldModel,
+    inverse_model: InverseDynamicsModel,
+    card: ModelCard,
+) -> dict[str, float]:
+    """Plans on pairs of the validation split: the best checkpoint is not chosen by the pairs that judge it."""
+    held_out, settings = make_dataset(cfg, data, "validation", drop_last=False), cfg.evaluation
+    pairs = StartGoalPairs.draw(held_out, cfg.env.name, settings.every_pairs, cfg.env.goal_offset, settings.seed)
+    outcome = evaluate_mpc(
+        make_policy(cfg.plan, model, inverse_model, (card.action_low, card.action_high), run_dir),
+        pairs,
+        budget=cfg.env.budget,
+        image_size=card.model["image_size"],
+        num_envs=settings.num_envs,
+        num_workers=settings.num_workers or None,
+        env_kwargs=card.env_kwargs,
+        progress_bar=False,
+    )
+    return {"success_rate": outcome.success_rate}
 
 
 def draw_pairs(cfg: DictConfig, data: Path) -> StartGoalPairs:

@@ -17,7 +17,6 @@ from episodes import describe_env
 from omegaconf import DictConfig, OmegaConf
 from planning import check_horizon, plan_config
 from torch import nn
-from torchrl.record.loggers import get_logger, Logger
 
 from torchrl_ficreg import (
     FICRegLoss,
@@ -107,27 +106,6 @@ def add_hooks(cfg: DictConfig, trainer: OfflineTrainer) -> None:
         ramp.register(trainer)
 
 
-def make_logger(cfg: DictConfig, run_dir: Path) -> Logger | None:
-    """A TorchRL logger besides ``metrics.csv``, where one is asked for.
-
-    Raises:
-        ImportError: its package is missing.
-    """
-    backend = cfg.logger.backend
-    if backend == "csv":
-        return None
-    try:
-        extra = {"wandb_kwargs": {"mode": cfg.logger.mode, "project": cfg.logger.project}} if backend == "wandb" else {}
-        logger = get_logger(backend, logger_name=str(run_dir / backend), experiment_name=cfg.name, **extra)
-    except ImportError as error:
-        package = "'torchrl_ficreg[wandb]'" if backend == "wandb" else "tensorboard"
-        raise ImportError(f"logger.backend={backend} needs a package: pip install {package}.") from error
-    settings = flatten(OmegaConf.to_container(cfg, resolve=True))
-    plain = (int, float, str, bool)  # all that tensorboard takes
-    logger.log_hparams({key: value if isinstance(value, plain) else str(value) for key, value in settings.items()})
-    return logger
-
-
 def make_card(cfg: DictConfig, dataset: OfflineTrajectories) -> ModelCard:
     """What a checkpoint tells about itself."""
     meta = dataset.meta
@@ -182,13 +160,13 @@ def check_settings(cfg: DictConfig) -> None:
     positive |= {"env.budget": cfg.env.budget, "env.goal_offset": cfg.env.goal_offset}
     positive |= {"evaluation.num_pairs": evaluation.num_pairs, "evaluation.num_envs": evaluation.num_envs}
     positive |= {"evaluation.record": evaluation.record, "logger.interval": cfg.logger.interval}
-    positive |= {"logger.alarm_interval": cfg.logger.alarm_interval}
+    positive |= {"logger.alarm_interval": cfg.logger.alarm_interval, "evaluation.every_pairs": evaluation.every_pairs}
     positive |= {"optim.validation_batches": optim.validation_batches, "env.data.max_steps": cfg.env.data.max_steps}
     wrong = [f"{key}={value}" for key, value in positive.items() if not value > 0]
     if wrong:
         raise ValueError(f"must be positive: {', '.join(wrong)}.")
     natural = {"seed": cfg.seed, "env.data.seed": cfg.env.data.seed, "evaluation.seed": evaluation.seed}
-    natural |= {"evaluation.num_workers": evaluation.num_workers}
+    natural |= {"evaluation.num_workers": evaluation.num_workers, "evaluation.every": evaluation.every}
     natural |= {"collect.num_workers": cfg.collect.num_workers, "optim.weight_decay": optim.weight_decay}
     wrong = [f"{key}={value}" for key, value in natural.items() if not 0 <= value < 2**63]
     if wrong:

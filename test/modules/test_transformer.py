@@ -90,3 +90,16 @@ def test_the_feed_forward_layer_uses_the_exact_gelu():
     layer, x = FeedForward(4, 8).double(), torch.randn(3, 4).double()
     hidden = layer[0](x)
     torch.testing.assert_close(layer(x), layer[3](hidden * 0.5 * (1 + torch.erf(hidden / 2**0.5))))
+
+
+def test_attention_weights_are_dropped_in_training_alone():
+    """With a share of 0.5, weights are 0 or twice their value; the mean over many draws is the output of eval mode."""
+    torch.manual_seed(0)
+    attention = Attention(8, 2, 4, causal=True, qkv_bias=False, weight_dropout=0.5)
+    x = torch.randn(1, 3, 8)
+    expected = attention.eval()(x)
+    assert attention(x).equal(expected)
+    attention.train()
+    draws = torch.stack([attention(x).detach() for _ in range(4000)])
+    assert not draws[0].equal(draws[1])
+    torch.testing.assert_close(draws.mean(0), expected, rtol=0, atol=0.05)

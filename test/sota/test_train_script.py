@@ -33,6 +33,7 @@ def test_a_run_leaves_exactly_the_documented_files(trained_once):
     _, left = trained_once
     (checkpoint,) = {name for name in left if name.startswith(f"{RUN}/checkpoints/")}
     run = ["config.yaml", "episodes.gif", "latent_distance.png", "learning_curve.png", "metrics.csv", "pairs.json"]
+    run += ["README.txt"]
     data = ["action.memmap", "episodes.jsonl", "meta.json", "pairs_4x25_seed0.json", "pixels.memmap", "state.memmap"]
     expected = {f"{RUN}/{name}" for name in [*run, "results.json"]} | {f"{DATA}/{name}" for name in data}
     assert left - {checkpoint} == expected

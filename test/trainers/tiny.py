@@ -11,7 +11,7 @@ import torch
 
 from torchrl_ficreg import FICRegLoss, LeWMLoss, make_world_model, ModelConfig
 from torchrl_ficreg.data import OfflineTrajectories
-from torchrl_ficreg.trainers import checkpoint_components, ModelCard, OfflineTrainer
+from torchrl_ficreg.trainers import checkpoint_components, ModelCard, OfflineTrainer, stop_on_signal
 
 SIZES = ModelConfig(
     encoder="conv",
@@ -33,10 +33,10 @@ SIZES = ModelConfig(
 LOW, HIGH = [-4.0, -4.0], [4.0, 4.0]
 
 
-def make_data(split: str = "train", *, episodes: int = 10, **settings) -> OfflineTrajectories:
-    """Random pictures and actions; 7 training episodes of 22 clips, hence 9 batches of 16 an epoch."""
+def record(episodes: int = 10) -> list[dict[str, np.ndarray]]:
+    """Random pictures and actions."""
     rng = np.random.default_rng(0)
-    recorded = [
+    return [
         {
             "pixels": rng.integers(0, 256, (24, 3, 16, 16), dtype=np.uint8),
             "action": np.pad(rng.uniform(-1, 1, (23, 2)), ((0, 1), (0, 0))).astype(np.float32),
@@ -44,8 +44,12 @@ def make_data(split: str = "train", *, episodes: int = 10, **settings) -> Offlin
         }
         for _ in range(episodes)
     ]
+
+
+def make_data(split: str = "train", *, episodes: int = 10, **settings) -> OfflineTrajectories:
+    """7 training episodes of 22 clips, hence 9 batches of 16 an epoch."""
     settings = {"split": split, "num_frames": 2, "frame_skip": 2, "batch_size": 16, **settings}
-    return OfflineTrajectories.from_episodes(recorded, **settings)
+    return OfflineTrajectories.from_episodes(record(episodes), **settings)
 
 
 def make_trainer(
@@ -104,3 +108,12 @@ def run(run_dir: Path, weights_file: Path) -> None:
     part = weights_file.with_suffix(".part")
     torch.save(weights(trainer), part)
     part.rename(weights_file)
+
+
+def run_until_told(run_dir: Path) -> None:
+    """A long run that stops when it is told to; says, by a file, from which step on it listens."""
+    trainer = make_trainer(run_dir, data=make_data(prefetch=1), validate=False, epochs=60)
+    trainer.resume()
+    with stop_on_signal(trainer):
+        run_dir.with_name(f"listens{trainer.step}").touch()
+        trainer.train()

@@ -20,6 +20,7 @@ from torchrl_ficreg.data.layout import META_FILE
 from torchrl_ficreg.data.replay import SeekableReplayBuffer
 from torchrl_ficreg.data.sampler import ClipSampler
 from torchrl_ficreg.data.schema import ACTION, DONE, EPISODE, PIXELS, STATE, STEP
+from torchrl_ficreg.data.shards import open_store
 from torchrl_ficreg.data.splits import Split, split_episodes
 from torchrl_ficreg.data.statistics import ActionStatistics
 from torchrl_ficreg.data.store import EpisodeStore, Verify
@@ -36,7 +37,7 @@ class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
     The data is read-only: ``extend`` refuses, and writing into a returned tensor never reaches the files.
 
     Args:
-        dataset_id: a dataset directory, its name under ``root``, or an opened
+        dataset_id: a dataset directory or one of shards, its name under ``root``, a list of them, or an opened
             :class:`~torchrl_ficreg.data.EpisodeStore`, which the datasets of several splits can share.
 
     Keyword Args:
@@ -46,12 +47,13 @@ class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
         split_seed: seed of the split.
         num_frames: T, frames of a clip.
         frame_skip: F, environment steps from one frame to the next.
-        batch_size: B, in clips. Needed for iterating, for ``drop_last`` and for ``prefetch``.
+        batch_size: B, in clips, over all processes. Needed for iterating, for ``drop_last`` and for ``prefetch``.
         keys: what a clip holds, among ``pixels``, ``action`` (with ``mask``), ``state``, ``episode``, ``step``.
         statistics: z-scores the actions. Default: measured on the training episodes, whatever ``split`` is.
         shuffle: ``False`` serves clips in their stored order.
         drop_last: leave out an incomplete last batch of an epoch; has no effect without ``batch_size``.
         seed: seed of the order.
+        part: (r, n) serves the r-th of n equal pieces of every batch, B / n clips: one process of n that train together.
         prefetch: batches read ahead by one background thread. The order and :meth:`state_dict` do not depend on it.
         pin_memory: put batches in pinned memory; has no effect without a CUDA device.
         transform: a TorchRL transform of sampled clips.
@@ -84,7 +86,7 @@ class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
 
     def __init__(
         self,
-        dataset_id: str | Path | EpisodeStore,
+        dataset_id: str | Path | Sequence[str | Path] | EpisodeStore,
         *,
         root: str | Path | None = None,
         split: Split = "train",
@@ -98,6 +100,7 @@ class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
         shuffle: bool = True,
         drop_last: bool = True,
         seed: int = 0,
+        part: tuple[int, int] = (0, 1),
         prefetch: int | None = None,
         pin_memory: bool = False,
         transform: Callable[[TensorDictBase], TensorDictBase] | None = None,
@@ -108,8 +111,7 @@ class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
         if isinstance(dataset_id, EpisodeStore):
             store = dataset_id
         else:
-            path = self._resolve(dataset_id)
-            store = EpisodeStore.open(path, allow_incomplete=allow_incomplete, verify=verify)
+            store = open_store(self._resolve(dataset_id), allow_incomplete=allow_incomplete, verify=verify)
         self.dataset_id = str(store.path or "memory") if isinstance(dataset_id, EpisodeStore) else str(dataset_id)
         self.split = split
         divide = {"fractions": tuple(split_fractions), "seed": split_seed}
@@ -128,14 +130,16 @@ class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
         )
         self._store, self._episode_ids, self._statistics = store, ids, statistics
         drop_last = drop_last and batch_size is not None
-        if batch_size is not None and len(clips) < (batch_size if drop_last else 1):
+        if batch_size is not None and batch_size % part[1]:
+            raise ValueError(f"{part[1]} processes cannot share a batch_size of {batch_size}: give a multiple of {part[1]}.")
+        if batch_size is not None and len(clips) < (batch_size if drop_last else part[1]):
             raise ValueError(
                 f"the {split!r} split holds {len(clips)} clips, less than one batch of {batch_size}: lower batch_size "
                 "or pass drop_last=False."
             )
         super().__init__(
             storage=clips,
-            sampler=ClipSampler(shuffle=shuffle, drop_last=drop_last, seed=seed),
+            sampler=ClipSampler(shuffle=shuffle, drop_last=drop_last, seed=seed, part=part),
             writer=ImmutableDatasetWriter(),
             batch_size=batch_size,
             prefetch=prefetch,
@@ -274,7 +278,9 @@ class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
         """Refuses: clips are cut when read, so there are no rows to map."""
         raise RuntimeError("clips are cut when read: pass transform=, or write new episodes with EpisodeWriter.")
 
-    def _resolve(self, dataset_id: str | Path) -> Path:
+    def _resolve(self, dataset_id: str | Path | Sequence[str | Path]) -> Path | list[Path]:
+        if not isinstance(dataset_id, (str, Path)):
+            return [self._resolve(shard) for shard in dataset_id]
         path = Path(dataset_id).expanduser()
         return path if path.is_dir() or path.is_absolute() else Path(self.root) / path
 

@@ -11,7 +11,7 @@ from typing import Any
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
-from torchrl_ficreg.data.sampler import batches_per_epoch, ClipSampler
+from torchrl_ficreg.data.sampler import ClipSampler
 
 _STATE_FILE = "position.json"
 
@@ -44,6 +44,11 @@ class SeekableReplayBuffer(TensorDictReplayBuffer):
         return self._delivered
 
     @property
+    def part(self) -> tuple[int, int]:
+        """(r, n): which of how many equal pieces of every batch is served."""
+        return self._sampler.part
+
+    @property
     def batches_per_epoch(self) -> int:
         """Batches that visit every item once.
 
@@ -52,7 +57,7 @@ class SeekableReplayBuffer(TensorDictReplayBuffer):
         """
         if self._batch_size is None:
             raise RuntimeError("an epoch has a number of batches only if batch_size is given to the constructor.")
-        return batches_per_epoch(len(self._storage), self._batch_size, self._sampler.drop_last)
+        return self._sampler.batches_per_epoch(len(self._storage), self._batch_size)
 
     def seek(self, batches: int) -> None:
         """Continues with batch number ``batches``, as if that many had been handed out.

@@ -20,15 +20,21 @@ class ClipSampler(SamplerWithoutReplacement):
 
     An item is whatever the storage counts; with :class:`~torchrl_ficreg.data.ClipStorage` it is a clip.
 
+    Several processes that train one model share every batch: the sampler of each draws the whole batch and hands out
+    its own piece. Together the pieces are the batch that one process would have drawn, and the position is the same
+    number everywhere, so that a run may be continued on another number of processes.
+
     Keyword Args:
         shuffle: ``False`` visits the clips in their stored order, in every epoch.
         drop_last: leave out the last clips of an epoch when they do not fill a batch. With ``False`` the last
-            batch of an epoch is shorter.
+            batch of an epoch is shorter; several processes then leave out what is not at least two clips for each.
         seed: not negative.
+        part: (r, n), the r-th of n equal pieces of every batch, r from 0.
 
     Raises:
-        ValueError: a negative seed; when drawing: fewer clips than one batch, or another batch size or number of
-            clips than before, under which the position would mean something else.
+        ValueError: a negative seed or an impossible part; when drawing: fewer clips than one batch, a batch that n
+            processes cannot share equally, or another batch size or number of clips than before, under which the
+            position would mean something else.
 
     Examples:
         >>> from torchrl.data import ReplayBuffer, TensorStorage
@@ -42,22 +48,30 @@ class ClipSampler(SamplerWithoutReplacement):
         True
     """
 
-    def __init__(self, *, shuffle: bool = True, drop_last: bool = True, seed: int = 0) -> None:
+    def __init__(
+        self, *, shuffle: bool = True, drop_last: bool = True, seed: int = 0, part: tuple[int, int] = (0, 1)
+    ) -> None:
         super().__init__(drop_last=drop_last, shuffle=shuffle)
         if seed < 0:
             raise ValueError(f"seed must not be negative, got {seed}.")
+        if not 0 <= part[0] < part[1]:
+            raise ValueError(f"part is (r, n) with 0 <= r < n, got {tuple(part)}.")
         self.seed = int(seed)
+        self.part = (int(part[0]), int(part[1]))
         self.batches = 0
         self._batch_size = 0  # 0: nothing drawn yet
         self._num_clips = 0
         self._order: tuple[int, np.ndarray] | None = None  # epoch and its permutation
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[torch.Tensor, dict[str, Any]]:
-        """The next batch of clip numbers, int64 [batch_size]."""
+        """The next batch of clip numbers, or this process's part of it, int64 [batch_size / n]."""
         self._bind(len(storage), batch_size)
-        per_epoch = batches_per_epoch(len(storage), batch_size, self.drop_last)
+        per_epoch = self.batches_per_epoch(len(storage), batch_size)
         epoch, batch = divmod(self.batches, per_epoch)
         index = self._epoch_order(epoch)[batch * batch_size : (batch + 1) * batch_size]
+        piece, pieces = self.part
+        share = len(index) // pieces  # of whole batches there is no rest
+        index = index[piece * share : (piece + 1) * share]
         self.batches += 1
         left = per_epoch - 1 - batch
         # TorchRL's iteration and prefetching read these two. `ran_out` goes first, since a prefetching thread
@@ -65,6 +79,14 @@ class ClipSampler(SamplerWithoutReplacement):
         self._ran_out = left == 0
         self._remaining_batches = left or per_epoch
         return torch.from_numpy(index.copy()), {}
+
+    def batches_per_epoch(self, num_clips: int, batch_size: int) -> int:
+        """Batches of one epoch over so many clips."""
+        pieces = self.part[1]
+        shared = num_clips - num_clips % pieces
+        if pieces > 1 and shared >= batch_size and shared % batch_size < 2 * pieces:
+            shared -= shared % batch_size  # a statistic of the batch needs two clips on every process
+        return batches_per_epoch(shared, batch_size, self.drop_last)
 
     def seek(self, batches: int) -> None:
         """Makes ``batches`` the number of batches drawn so far: the next one is batch number ``batches``.
@@ -77,12 +99,12 @@ class ClipSampler(SamplerWithoutReplacement):
         self.batches = int(batches)
         self._ran_out = False
         if self._batch_size:
-            per_epoch = batches_per_epoch(self._num_clips, self._batch_size, self.drop_last)
+            per_epoch = self.batches_per_epoch(self._num_clips, self._batch_size)
             self._remaining_batches = per_epoch - self.batches % per_epoch
 
     def can_sample(self, storage: Storage, batch_size: int) -> bool:
         """Whether the storage fills one batch."""
-        return len(storage) >= (batch_size if self.drop_last else 1)
+        return len(storage) >= (batch_size if self.drop_last else self.part[1])
 
     def state_dict(self) -> dict[str, int]:
         """Plain numbers. With prefetching, ``batches`` counts those not yet handed out: see ``OfflineTrajectories``."""
@@ -108,7 +130,12 @@ class ClipSampler(SamplerWithoutReplacement):
         return f"{type(self).__name__}({flags}, batches={self.batches})"
 
     def _bind(self, num_clips: int, batch_size: int) -> None:
-        if batch_size < 1 or num_clips < (batch_size if self.drop_last else 1):
+        if batch_size % self.part[1]:
+            raise ValueError(
+                f"{self.part[1]} processes cannot share a batch of {batch_size} clips equally: choose a multiple of "
+                f"{self.part[1]}."
+            )
+        if batch_size < 1 or num_clips < (batch_size if self.drop_last else self.part[1]):
             raise ValueError(
                 f"{num_clips} clips do not fill a batch of {batch_size}: lower batch_size or pass drop_last=False."
             )

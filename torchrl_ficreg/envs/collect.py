@@ -14,7 +14,7 @@ import numpy as np
 
 from torchrl_ficreg.data.schema import ACTION, PIXELS, STATE, SUCCESS
 from torchrl_ficreg.envs.base import GOAL_STATE, GoalEnv
-from torchrl_ficreg.envs.registry import EnvEntry, find_entry
+from torchrl_ficreg.envs.registry import EnvEntry, Expert, find_entry
 from torchrl_ficreg.envs.workers import ordered_map
 
 
@@ -110,6 +110,19 @@ class EpisodeRecorder:
     env_kwargs: dict[str, Any]
     _env: GoalEnv | None = field(default=None, init=False, repr=False)
 
+    @property
+    def env(self) -> GoalEnv:
+        """The environment, built when it is first asked for."""
+        if self._env is None:
+            self._env = self.entry.load_env()(**self.env_kwargs)
+        return self._env
+
+    def begin(self, index: int) -> tuple[GoalEnv, Expert, dict[str, np.ndarray], dict[str, Any]]:
+        """Sets an episode up: the environment, a new expert, and the observation and info of the start."""
+        task_seed, expert_seed = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(2)
+        expert = self.entry.load_expert()(rng=np.random.default_rng(expert_seed), env=self.env, **self.expert_kwargs)
+        return self.env, expert, *self.env.reset(seed=int(task_seed.generate_state(1)[0]))
+
     def __call__(self, index: int) -> dict[str, np.ndarray]:
         """Records one episode.
 
@@ -119,12 +132,7 @@ class EpisodeRecorder:
         Returns:
             the arrays described at :func:`collect_episodes`.
         """
-        if self._env is None:
-            self._env = self.entry.load_env()(**self.env_kwargs)
-        env = self._env
-        task_seed, expert_seed = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(2)
-        expert = self.entry.load_expert()(rng=np.random.default_rng(expert_seed), env=env, **self.expert_kwargs)
-        observation, info = env.reset(seed=int(task_seed.generate_state(1)[0]))
+        env, expert, observation, info = self.begin(index)
         pixels, states, actions = [observation[PIXELS]], [observation[STATE]], []
         while len(actions) < self.max_steps and not (self.stop_at_success and info[SUCCESS].item()):
             action = expert(observation[STATE], observation[GOAL_STATE])

@@ -74,6 +74,7 @@ class CausalTransformer(nn.Module):
         action_dim: width F * A of an action block.
         history: H, the longest window of latents it sees.
         width, depth, heads, dim_head, mlp_dim, dropout: of the transformer.
+        attention_dropout: of its attention weights.
         projector_dim: hidden width of the BatchNorm projector at its end.
         action_bottleneck: see :class:`ActionEmbedding`.
     """
@@ -90,6 +91,7 @@ class CausalTransformer(nn.Module):
         dim_head: int = 64,
         mlp_dim: int = 2048,
         dropout: float = 0.1,
+        attention_dropout: float = 0.0,
         projector_dim: int = 2048,
         action_bottleneck: int = 10,
     ) -> None:
@@ -98,7 +100,9 @@ class CausalTransformer(nn.Module):
         self.action_embedding = ActionEmbedding(action_dim, width, action_bottleneck)
         self.to_width = nn.Identity() if latent_dim == width else nn.Linear(latent_dim, width)
         self.position = nn.Parameter(torch.empty(1, history, width))
-        self.blocks = nn.ModuleList(AdaptiveBlock(width, heads, dim_head, mlp_dim, dropout) for _ in range(depth))
+        self.blocks = nn.ModuleList(
+            AdaptiveBlock(width, heads, dim_head, mlp_dim, dropout, attention_dropout) for _ in range(depth)
+        )
         self.norm = nn.LayerNorm(width)
         self.projector = Projector(width, projector_dim, latent_dim)
         self.reset_parameters()

@@ -37,6 +37,7 @@ class ModelConfig:
     predictor_mlp_dim: int = 2048
     predictor_projector_dim: int = 2048
     predictor_dropout: float = 0.1
+    predictor_attention_dropout: float = 0.0  # of the attention weights; the published predictor has 0.1
     inverse_kind: Literal["mlp", "gaussian", "ensemble", "transformer"] = "mlp"
     inverse_hidden_dim: int = 512  # hidden width of the inverse dynamics model
 
@@ -47,13 +48,15 @@ class ModelConfig:
             raise ValueError(f"unknown encoder {self.encoder!r}: choose 'vit', 'conv' or 'keypoint'.")
         if self.inverse_kind not in INVERSE_NETWORKS:
             raise ValueError(f"unknown inverse_kind {self.inverse_kind!r}: choose one of {sorted(INVERSE_NETWORKS)}.")
-        sizes = {name: value for name, value in asdict(self).items() if not isinstance(value, (str, float)) and name != "predictor_dropout"}
+        shares = ("predictor_dropout", "predictor_attention_dropout")
+        sizes = {n: value for n, value in asdict(self).items() if not isinstance(value, (str, float)) and n not in shares}
         sizes = {name: value if isinstance(value, tuple) else (value,) for name, value in sizes.items()}
         small = [name for name, values in sizes.items() if min(values, default=0) < 1]
         if small:
             raise ValueError(f"model sizes must be positive, got {', '.join(f'{n}={getattr(self, n)}' for n in small)}.")
-        if not 0 <= self.predictor_dropout < 1:
-            raise ValueError(f"predictor_dropout must lie in [0, 1), got {self.predictor_dropout}.")
+        for name in shares:
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"{name} must lie in [0, 1), got {getattr(self, name)}.")
 
     @classmethod
     def preset(cls, name: str, **changes) -> ModelConfig:
@@ -70,7 +73,7 @@ class ModelConfig:
 
 
 PRESETS = {
-    "paper": ModelConfig(),
+    "paper": ModelConfig(predictor_attention_dropout=0.1),
     "cpu": ModelConfig(
         encoder="conv",
         image_size=64,
@@ -118,6 +121,7 @@ def make_world_model(config: ModelConfig, action_dim: int) -> tuple[LatentWorldM
         dim_head=config.predictor_dim_head,
         mlp_dim=config.predictor_mlp_dim,
         dropout=config.predictor_dropout,
+        attention_dropout=config.predictor_attention_dropout,
         projector_dim=config.predictor_projector_dim,
     )
     extra = {"history": config.history} if config.inverse_kind == "transformer" else {}

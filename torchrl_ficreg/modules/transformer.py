@@ -18,7 +18,9 @@ Cache = tuple[torch.Tensor, torch.Tensor]  # keys and values, each [N, heads, T,
 FEW = 4  # tokens up to which attention costs less by elementwise products than by matrix products, on CPUs
 
 
-def attend(query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: bool) -> torch.Tensor:
+def attend(
+    query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: bool, dropout: float = 0.0
+) -> torch.Tensor:
     """Softmax attention by the kernel that is fastest on the device at hand.
 
     The fused kernel wins on CUDA. On CPUs its backward pass costs twice that of two plain matrix products around
@@ -29,20 +31,22 @@ def attend(query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: 
         query: [N, heads, Q, dim_head], any floating dtype.
         key, value: [N, heads, T, dim_head].
         causal: a token sees itself and earlier ones only; Q = T then.
+        dropout: share of the attention weights dropped; 0 outside of training.
 
     Returns:
         [N, heads, Q, dim_head].
     """
     if query.device.type != "cpu":
-        return F.scaled_dot_product_attention(query, key, value, is_causal=causal)
-    if key.shape[-2] <= FEW and not (torch.is_grad_enabled() and query.requires_grad):
+        return F.scaled_dot_product_attention(query, key, value, is_causal=causal, dropout_p=dropout)
+    if key.shape[-2] <= FEW and not dropout and not (torch.is_grad_enabled() and query.requires_grad):
         return _attend_to_few(query, key, value, causal)
     scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)  # [N, heads, Q, T]
     if causal:
         tokens = scores.shape[-1]
         future = torch.ones(tokens, tokens, dtype=torch.bool, device=scores.device).triu(1)  # [T, T]
         scores = scores.masked_fill(future, -torch.inf)
-    return scores.softmax(-1).to(value.dtype) @ value
+    weights = scores.softmax(-1).to(value.dtype)
+    return (F.dropout(weights, dropout) if dropout else weights) @ value
 
 
 def _attend_to_few(query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: bool) -> torch.Tensor:
@@ -71,13 +75,22 @@ class Attention(nn.Module):
         causal: a token sees itself and earlier ones only.
         qkv_bias: bias of the query, key and value projection.
         dropout: after the output projection.
+        weight_dropout: of the attention weights.
     """
 
     def __init__(
-        self, dim: int, heads: int, dim_head: int, *, causal: bool, qkv_bias: bool, dropout: float = 0.0
+        self,
+        dim: int,
+        heads: int,
+        dim_head: int,
+        *,
+        causal: bool,
+        qkv_bias: bool,
+        dropout: float = 0.0,
+        weight_dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        self.heads, self.causal = heads, causal
+        self.heads, self.causal, self.weight_dropout = heads, causal, weight_dropout
         self.inner = heads * dim_head
         self.to_qkv = Linear(dim, 3 * self.inner, bias=qkv_bias)
         self.to_out = Linear(self.inner, dim)
@@ -85,16 +98,17 @@ class Attention(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """[N, T, C] -> [N, T, C]."""
-        if x.shape[-2] == 1:
+        drop = self.weight_dropout if self.training else 0.0
+        if x.shape[-2] == 1 and not drop:
             # One token attends to itself alone: the softmax is 1 whatever query and key are.
             bias = self.to_qkv.bias[2 * self.inner :] if self.to_qkv.bias is not None else None
             mixed = F.linear(x, self.to_qkv.weight[2 * self.inner :], bias)  # [N, 1, inner]
         else:
             packed = self.to_qkv(x)  # [N, T, 3 * inner]
-            if trains_on_cpu(packed) and not self.causal:
+            if trains_on_cpu(packed) and not self.causal and not drop:
                 mixed = packed_attention(packed, self.heads)
             else:
-                mixed = attend(*self._heads(packed, 3).unbind(0), self.causal).transpose(1, 2).flatten(2)
+                mixed = attend(*self._heads(packed, 3).unbind(0), self.causal, drop).transpose(1, 2).flatten(2)
         return self.dropout(self.to_out(mixed))  # of [N, T, inner]
 
     def first(self, x: torch.Tensor) -> torch.Tensor:
@@ -180,12 +194,16 @@ class AdaptiveBlock(nn.Module):
     :meth:`modulation` may be computed once and reused while the tokens change, as a planner does.
     """
 
-    def __init__(self, dim: int, heads: int, dim_head: int, mlp_dim: int, dropout: float) -> None:
+    def __init__(
+        self, dim: int, heads: int, dim_head: int, mlp_dim: int, dropout: float, weight_dropout: float = 0.0
+    ) -> None:
         super().__init__()
         self.adaptive_norm = nn.LayerNorm(dim, eps=1e-6, elementwise_affine=False)
         self.to_modulation = nn.Linear(dim, 6 * dim)
         self.attn_norm = nn.LayerNorm(dim)
-        self.attn = Attention(dim, heads, dim_head, causal=True, qkv_bias=False, dropout=dropout)
+        self.attn = Attention(
+            dim, heads, dim_head, causal=True, qkv_bias=False, dropout=dropout, weight_dropout=weight_dropout
+        )
         self.mlp_norm = nn.LayerNorm(dim)
         self.mlp = FeedForward(dim, mlp_dim, dropout)
         self.reset_parameters()
@@ -220,5 +238,5 @@ class AdaptiveBlock(nn.Module):
 
 
 def _modulate(x: torch.Tensor, shift: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
-    """x (1 + scale) + shift, all [N, T, C], in two passes over memory."""
+    """Tokens x (1 + scale) + shift, all [N, T, C], in two passes over memory."""
     return torch.addcmul(x + shift, x, scale)

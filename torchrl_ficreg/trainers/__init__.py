@@ -2,27 +2,40 @@
 
 from torchrl_ficreg.trainers.checkpoint import checkpoint_components, find_checkpoint, load_world_model, ModelCard
 from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
+from torchrl_ficreg.trainers.meter import Meter
 from torchrl_ficreg.trainers.offline import OfflineTrainer
 from torchrl_ficreg.trainers.refinement import LatentsAsFrames, NoRegularizer, on_frozen_latents, Refinement
 from torchrl_ficreg.trainers.schedule import WarmupCosine
+from torchrl_ficreg.trainers.signals import exit_on_signal, Preempted, PREEMPTED, stop_on_signal
 from torchrl_ficreg.trainers.stepper import OfflineStepper
+from torchrl_ficreg.trainers.stream import ReadError
+from torchrl_ficreg.trainers.success import SuccessRate
+from torchrl_ficreg.trainers.tolerant import TolerantLogger
 from torchrl_ficreg.trainers.watch import CoefficientSchedule, LatentAlarm
 
 __all__ = [
     "CoefficientSchedule",
     "LatentAlarm",
     "LatentsAsFrames",
+    "Meter",
     "MetricsTable",
     "ModelCard",
     "NoRegularizer",
     "OfflineStepper",
     "OfflineTrainer",
+    "PREEMPTED",
+    "Preempted",
     "Progress",
+    "ReadError",
     "Refinement",
+    "SuccessRate",
+    "TolerantLogger",
     "Validation",
     "WarmupCosine",
     "checkpoint_components",
+    "exit_on_signal",
     "find_checkpoint",
     "load_world_model",
     "on_frozen_latents",
+    "stop_on_signal",
 ]

@@ -15,6 +15,7 @@ from torchrl_ficreg.modules.pretrained.folder import load_pretrained, WEIGHTS_FI
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 CHECKPOINTS = "checkpoints"
+SUCCESS = "success_rate"  # in the manifest of a checkpoint; negative where it was not measured
 _CARD, _MODEL, _INVERSE = "card", "world_model", "inverse_model"
 DAMAGES = (CheckpointError, zipfile.BadZipFile, EOFError)  # what reading a damaged or foreign checkpoint raises
 
@@ -51,20 +52,41 @@ def checkpoint_components(
     return {_MODEL: model, _INVERSE: inverse_model, _CARD: asdict(card)}
 
 
-def find_checkpoint(path: Path | str) -> Path:
+def find_checkpoint(path: Path | str, *, best: bool = False) -> Path:
     """The checkpoint a user means: a checkpoint itself, or the latest of a run directory.
 
+    Args:
+        path: of either.
+        best: of a run directory, the one of the highest success instead, see :class:`SuccessRate`.
+
     Raises:
-        FileNotFoundError: there is none.
+        FileNotFoundError: there is none, or success was never measured.
     """
     path = Path(path).expanduser()
     if Checkpoint.is_checkpoint(path):
         return path
     for directory in (path / CHECKPOINTS, path):
-        latest = CheckpointRotation(directory, keep_last=1).latest() if directory.is_dir() else None
-        if latest is not None:
-            return latest
+        rotation = CheckpointRotation(directory, keep_last=1, keep_best=(SUCCESS, "max"))
+        found = (rotation.best() if best else rotation.latest()) if directory.is_dir() else None
+        if found is not None and best and Checkpoint.manifest(found)["metadata"][SUCCESS] < 0:
+            found = None
+        if found is not None:
+            return found
+    if best:
+        raise FileNotFoundError(f"no checkpoint with a measured success at {path}: train with evaluation.every=1, say.")
     raise FileNotFoundError(f"no checkpoint at {path}: give a run directory that train.py made, or a checkpoint in it.")
+
+
+def read_card(path: Path | str) -> ModelCard:
+    """The card of a checkpoint.
+
+    Raises:
+        ValueError: a checkpoint of another kind, or a damaged one.
+    """
+    try:
+        return ModelCard(**Checkpoint(card={}).load(path, components=[_CARD]).values[_CARD])
+    except (*DAMAGES, TypeError, KeyError) as error:
+        raise ValueError(f"{path} is not a whole checkpoint of a world model ({error}).") from error
 
 
 def load_world_model(path: Path | str) -> tuple[LatentWorldModel, InverseDynamicsModel | None, ModelCard]:
@@ -88,9 +110,8 @@ def load_world_model(path: Path | str) -> tuple[LatentWorldModel, InverseDynamic
             raise ValueError(f"{path} has no card, so its environment is unknown: save it with save_pretrained(card=).")
         return model, inverse_model, ModelCard(**card)
     path = find_checkpoint(path)
+    card = read_card(path)
     try:
-        values = Checkpoint(card={}).load(path, components=[_CARD]).values
-        card = ModelCard(**values[_CARD])
         model, inverse_model = make_world_model(ModelConfig(**card.model), card.action_dim)
         parts = {_MODEL: model, _INVERSE: inverse_model}
         Checkpoint(**parts).load(path, components=list(parts), map_location="cpu")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import os
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,78 +13,61 @@ from torchrl.trainers import Trainer, TrainerHookBase
 from tqdm import tqdm
 
 from torchrl_ficreg.modules.precision import autocast, Precision
-
-# Validation rows lack these, and where an epoch is shorter than the interval one of them comes first.
-_TRAIN_ONLY = ("grad_norm", "learning_rate", "steps_per_second")
+from torchrl_ficreg.trainers.distributed import average
+from torchrl_ficreg.trainers.meter import Meter
+from torchrl_ficreg.trainers.rows import CsvRows
 
 
 class MetricsTable(TrainerHookBase):
     """Writes one row of ``metrics.csv`` every few steps and hands the numbers to the trainer's logger.
 
-    Columns are fixed by the first row. A resumed run drops the rows that were written after its checkpoint. The first
-    step of a process is always handed to the logger, so that hooks such as TorchRL's ``EarlyStopping`` find a value.
+    A resumed run drops the rows that were written after its checkpoint. The first step of a process is always handed to
+    the logger, so that hooks such as TorchRL's ``EarlyStopping`` find a value.
 
     Args:
         path: the CSV file, or None for the logger alone.
         interval: steps between rows.
         last_step: steps of the whole run; the last one always gets a row.
+        meter: speed and memory go into every row of training.
     """
 
-    def __init__(self, path: Path | None, interval: int, last_step: int) -> None:
+    def __init__(self, path: Path | None, interval: int, last_step: int, meter: Meter | None = None) -> None:
         self.path, self.interval, self.last_step = path, interval, last_step
-        self._since = (time.perf_counter(), 0)
+        self.meter = Meter(1) if meter is None else meter
+        self._rows = None if path is None else CsvRows(path, first=("step", "split"))
         self._silent = True
         self.extra: dict[str, float] = {}  # what other hooks want in every row, as LatentAlarm does
 
     def __call__(self, optim_steps: int, losses: TensorDictBase) -> dict[str, float] | None:
         """Called after every optimisation step."""
-        due = optim_steps % self.interval == 0 or optim_steps == self.last_step
+        due = self.due(optim_steps)
         if not due and not self._silent:
             return None
         self._silent = False
-        now, (then, before) = time.perf_counter(), self._since
-        self._since = (now, optim_steps)
-        row = {key: value.float().mean().item() for key, value in sorted(losses.items())} | self.extra
-        row["steps_per_second"] = (optim_steps - before) / max(now - then, 1e-9)
+        names = sorted(losses.keys(), key=lambda name: (name.startswith("grad_norm_"), name))  # single networks last
+        row = {name: losses[name].float().mean().item() for name in names} | self.extra
+        row |= self.meter.look(optim_steps)
         if due:
             self._write({"step": optim_steps, "split": "train", **row})
         return row
 
-    def write_validation(self, step: int, terms: dict[str, float]) -> None:
-        """Adds a row of validation terms."""
-        self._write({"step": step, "split": "validation", **terms})
+    def due(self, step: int) -> bool:
+        """Whether this step gets a row."""
+        return step % self.interval == 0 or step == self.last_step
+
+    def write_validation(self, step: int, terms: dict[str, float], split: str = "validation") -> None:
+        """Adds a row of terms of held-out data."""
+        self._write({"step": step, "split": split, **terms})
 
     def _write(self, row: dict[str, Any]) -> None:
-        if self.path is None:
-            return
-        new = not self.path.exists()
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with open(self.path, "a", newline="") as file:
-            columns = list(dict.fromkeys([*row, *_TRAIN_ONLY])) if new else self._columns()
-            writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
-            if new:
-                writer.writeheader()
-            writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
-
-    def _columns(self) -> list[str]:
-        with open(self.path, newline="") as file:
-            return next(csv.reader(file))
+        if self._rows is not None:
+            self._rows.append(row)
 
     def drop_after(self, step: int) -> None:
-        """Removes rows of later steps, atomically."""
-        self._since = (time.perf_counter(), step)
-        if self.path is None or not self.path.exists():
-            return
-        with open(self.path, newline="") as file:
-            header, *rows = [*csv.reader(file)] or [[]]  # a kill may leave an empty file
-        kept = [row for row in rows if len(row) == len(header) and int(row[0]) <= step]
-        if not kept:
-            self.path.unlink()
-            return
-        part = self.path.with_suffix(".part")
-        with open(part, "w", newline="") as file:
-            csv.writer(file).writerows([header, *kept])
-        os.replace(part, self.path)
+        """Removes rows of later steps, in one piece, and begins to measure speed."""
+        self.meter.begin(step)
+        if self._rows is not None:
+            self._rows.drop_after(step)
 
     def register(self, trainer: Trainer, name: str = "metrics_table") -> None:
         """Registers after each optimisation step."""
@@ -127,7 +107,7 @@ class Validation(TrainerHookBase):
             for _ in range(self.batches):
                 clip = self.replay_buffer.sample().to(batch.device)
                 with autocast(batch.device, self.precision):
-                    outputs.append(loss(clip))
+                    outputs.append(average(loss(clip)))
         loss.train()
         terms = {key: torch.stack([out[key].float().mean() for out in outputs]).mean().item() for key in outputs[0].keys()}
         self.table.write_validation(step, terms)

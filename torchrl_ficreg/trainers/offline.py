@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,18 @@ from torchrl.trainers import Trainer
 from torchrl.trainers.trainers import LRSchedulerHook
 
 from torchrl_ficreg.data import OfflineTrajectories
+from torchrl_ficreg.modules.memory import keep_freed_memory
 from torchrl_ficreg.modules.precision import Precision
 from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, DAMAGES
+from torchrl_ficreg.trainers.clock import Clock
+from torchrl_ficreg.trainers.distributed import from_main, is_main, rank, wait_for_all, world_size
 from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
+from torchrl_ficreg.trainers.meter import Meter
+from torchrl_ficreg.trainers.parallel import parallelise, Strategy
 from torchrl_ficreg.trainers.schedule import WarmupCosine
 from torchrl_ficreg.trainers.stepper import OfflineStepper
-from torchrl_ficreg.trainers.stream import ReplayStream
+from torchrl_ficreg.trainers.stream import ReadError, ReplayStream
+from torchrl_ficreg.trainers.tolerant import TolerantLogger
 
 METRICS = "metrics.csv"
 
@@ -38,6 +43,19 @@ class OfflineTrainer(Trainer):
     one. :meth:`resume` continues from the latest, and on one device a resumed run ends with the very weights of an
     unbroken one: optimiser, schedule, random state and the position in the data are part of a checkpoint.
 
+    What goes wrong on the way, and what happens then; the checkpoints already there are never touched:
+
+    ========================================  =====================================================================
+    a loss or gradient is not finite          stops, ``FloatingPointError``; no weight is updated
+    a batch cannot be read                    stops, :class:`ReadError`; a single process writes a checkpoint first
+    a file of the dataset vanishes            warns and goes on (the mapping still holds it); shorter: cannot be read
+    no room for a checkpoint                  stops, ``OSError``
+    no room for ``metrics.csv``               warns and goes on; rows wait in memory until there is room
+    the logger fails                          warns and goes on without it
+    SIGTERM, inside :class:`stop_on_signal`   writes a checkpoint after the step and exits with code 85
+    SIGKILL, a crash, a power cut             continues from the last checkpoint when started again
+    ========================================  =====================================================================
+
     Args:
         loss_module: a loss such as :class:`~torchrl_ficreg.FICRegLoss`, already on its device.
         replay_buffer: training clips, in whole batches (``drop_last``).
@@ -53,6 +71,7 @@ class OfflineTrainer(Trainer):
         log_interval: steps between rows of ``metrics.csv``.
         logger: a TorchRL logger that receives the same numbers.
         progress_bar: show one.
+        strategy: of several processes, ``"ddp"`` or ``"fsdp"``; see :mod:`~torchrl_ficreg.trainers.parallel`.
 
     Raises:
         FloatingPointError: a loss stopped being finite, see :class:`OfflineStepper`.
@@ -77,6 +96,7 @@ class OfflineTrainer(Trainer):
         log_interval: int = 10,
         logger: Logger | None = None,
         progress_bar: bool = True,
+        strategy: Strategy = "ddp",
     ) -> None:
         if epochs < 1 or lr <= 0 or weight_decay < 0 or clip_norm <= 0 or not 0 <= warmup < 1 or log_interval < 1:
             raise ValueError(
@@ -92,18 +112,25 @@ class OfflineTrainer(Trainer):
             raise ValueError("a loss with reduction='none' has no single number to descend: build it with 'mean'.")
         self.total_steps = epochs * self.steps_per_epoch
         frames = replay_buffer.batch_size * replay_buffer.num_frames  # of one step
-        params = [p for p in loss_module.parameters() if p.requires_grad]
+        self._check_parts(replay_buffer, validation_buffer)
+        self.parallel = parallelise(loss_module, strategy)
+        params = self.parallel.params
+        if params[0].device.type == "cpu":
+            keep_freed_memory(2**31 - 1)  # the activations of a step, which the next one needs again
+        stream = ReplayStream(replay_buffer, params[0].device)
+        meter = Meter(replay_buffer.batch_size, lambda: stream.waited, params[0].device)
+        metrics = None if run_dir is None or not is_main() else Path(run_dir) / METRICS
+        self.metrics_table = MetricsTable(metrics, log_interval, self.total_steps, meter)
         optimizer = torch.optim.AdamW(params, lr=lr, weight_decay=weight_decay, fused=params[0].device.type != "mps")
         rotation = None if run_dir is None else CheckpointRotation(Path(run_dir) / CHECKPOINTS, keep_last=2)
         super().__init__(
-            collector=ReplayStream(replay_buffer, params[0].device),
+            collector=stream,
             total_frames=self.total_steps * frames,
-            frame_skip=1,
+            frame_skip=world_size(),  # so that frames count over all processes
             optim_steps_per_batch=1,
             loss_module=loss_module.train(),
             optimizer=optimizer,
-            optimization_stepper=OfflineStepper(precision, clip_norm),
-            logger=logger,
+            optimization_stepper=OfflineStepper(precision, clip_norm, self.metrics_table.due),
             progress_bar=False,
             auto_log_optim_steps=False,
             log_interval=0,
@@ -111,35 +138,49 @@ class OfflineTrainer(Trainer):
             checkpoint=None if run_dir is None else Checkpoint(format="archive", rng=GlobalRNGState(), **(components or {})),
             checkpoint_rotation=rotation,
         )
+        self._checkpoint_skip_warnings.add("logger")  # it has no state, on purpose
+        self.logger = TolerantLogger.around(logger) if is_main() else None
         self.schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, WarmupCosine(self.total_steps, warmup))
         LRSchedulerHook(self.schedule, interval="optim").register(self)
         self.clock = Clock()
         self.register_module("clock", self.clock)
-        metrics = None if run_dir is None else Path(run_dir) / METRICS
-        self.metrics_table = MetricsTable(metrics, log_interval, self.total_steps)
         self.metrics_table.register(self)
         if validation_buffer is not None:
             hook = Validation(validation_buffer, self.steps_per_epoch, validation_batches, precision, self.metrics_table)
             hook.register(self)
-        if progress_bar:
+        if progress_bar and is_main():
             Progress(self.total_steps, log_interval).register(self)
+
+    @staticmethod
+    def _check_parts(*buffers: OfflineTrajectories | None) -> None:
+        for part in (buffer.part for buffer in buffers if buffer is not None):
+            if part != (rank(), world_size()):
+                raise ValueError(
+                    f"process {rank()} of {world_size()} was given a dataset with part={part}: make its datasets with "
+                    "part=(rank(), world_size())."
+                )
 
     @property
     def step(self) -> int:
         """Optimisation steps taken."""
         return self._optim_count
 
-    def resume(self) -> bool:
-        """Loads the latest checkpoint of the run, if there is one, and says whether there was.
+    def resume(self, start: Path | str | None = None) -> bool:
+        """Loads the latest checkpoint of the run, if there is one, and says whether anything was loaded.
+
+        Args:
+            start: a checkpoint, of another run say, to begin from where the run has none yet.
 
         Raises:
             ValueError: the checkpoint is damaged, or belongs to other networks, data or hooks.
         """
         latest = None if self.checkpoint_rotation is None else self.checkpoint_rotation.latest()
         self._look_for_damage()
+        latest = from_main(start if latest is None else latest)
         if latest is not None:
             try:
-                self.checkpoint_rotation.load_latest(self._sync_checkpoint_components())
+                checkpoint = Checkpoint() if self.checkpoint is None else self.checkpoint
+                self._sync_checkpoint_components(checkpoint).load(latest)
             except DAMAGES as error:
                 raise ValueError(
                     f"{latest} cannot be continued ({error}): repeat the settings it was made with, or, if it is "
@@ -151,6 +192,7 @@ class OfflineTrainer(Trainer):
                     f"{latest} was scheduled for {planned} steps, not {self.total_steps}: the learning rate has fallen "
                     "accordingly. Repeat its epochs and batch size, or begin another run."
                 )
+            self.parallel.restored(self.optimizer)
             _align(self.optimizer)
         self._sweep()
         self.metrics_table.drop_after(self.step)
@@ -185,9 +227,21 @@ class OfflineTrainer(Trainer):
                 )
         super().save_trainer(force_save)
 
+    def _save_trainer(self) -> None:
+        with self.parallel.whole(self.optimizer):
+            if is_main():
+                try:
+                    super()._save_trainer()
+                except (OSError, RuntimeError) as error:  # PyTorch reports a file that cannot grow as a RuntimeError
+                    raise OSError(
+                        f"the checkpoint of step {self.step} cannot be written ({error}): make room; the same command "
+                        "continues from the last one."
+                    ) from error
+            wait_for_all()  # a process that ended meanwhile would have torchrun stop the writer too
+
     def _sweep(self) -> None:
         """Removes what a killed process left half-written beside its checkpoints."""
-        if self.checkpoint_rotation is None:
+        if self.checkpoint_rotation is None or not is_main():
             return
         for pattern in (".*.stage-*", ".*.archive-*", ".*.delete-*"):
             for left in self.checkpoint_rotation.directory.glob(pattern):
@@ -197,8 +251,14 @@ class OfflineTrainer(Trainer):
         """Runs to the end, or not at all when the resumed run had reached it."""
         if self.step < self.total_steps:
             self.clock.start()
-            super().train()
+            try:
+                super().train()
+            except ReadError:
+                if world_size() == 1:  # the other processes are at work on the next batch already
+                    self.save_trainer(force_save=True)
+                raise
             self.clock.stop()
+        self.parallel.finished(self.optimizer)
 
 
 def _align(optimizer: torch.optim.Optimizer) -> None:
@@ -211,31 +271,3 @@ def _align(optimizer: torch.optim.Optimizer) -> None:
         for key, value in state.items():
             if torch.is_tensor(value) and value.shape == parameter.shape:
                 state[key] = torch.empty_like(parameter, requires_grad=False).copy_(value)
-
-
-class Clock:
-    """Wall time spent in training, over all lives of a run."""
-
-    def __init__(self) -> None:
-        self._before, self._began = 0.0, None
-
-    @property
-    def seconds(self) -> float:
-        """Seconds so far."""
-        return self._before + (time.perf_counter() - self._began if self._began is not None else 0.0)
-
-    def start(self) -> None:
-        """Begins to count."""
-        self._began = time.perf_counter()
-
-    def stop(self) -> None:
-        """Ceases to count."""
-        self._before, self._began = self.seconds, None
-
-    def state_dict(self) -> dict[str, float]:
-        """The seconds so far."""
-        return {"seconds": self.seconds}
-
-    def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """Continues from there."""
-        self._before = float(state_dict["seconds"])

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
 from torchrl.trainers import Trainer
 from torchrl.trainers.trainers import OptimizationStepper
 
 from torchrl_ficreg.modules.precision import autocast, Precision
+from torchrl_ficreg.trainers.distributed import average
 
 
 class OfflineStepper(OptimizationStepper):
@@ -17,32 +19,42 @@ class OfflineStepper(OptimizationStepper):
     Args:
         precision: see :func:`~torchrl_ficreg.modules.precision.autocast`.
         clip_norm: largest gradient norm over all parameters.
+        norms_due: says at which step the gradient norms of the single networks are wanted besides the norm of all.
 
     Raises:
         FloatingPointError: a loss or a gradient is not finite. No weight is updated; the message names the step, the
             term and the last good checkpoint.
     """
 
-    def __init__(self, precision: Precision = "auto", clip_norm: float = 1.0) -> None:
-        self.precision, self.clip_norm = precision, clip_norm
+    def __init__(
+        self,
+        precision: Precision = "auto",
+        clip_norm: float = 1.0,
+        norms_due: Callable[[int], bool] = lambda step: False,
+    ) -> None:
+        self.precision, self.clip_norm, self.norms_due = precision, clip_norm, norms_due
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
-        """Takes one step and returns the detached terms, ``grad_norm`` before clipping and ``learning_rate``."""
+        """Takes one step and returns the detached terms, ``grad_norm`` before clipping and ``learning_rate``.
+
+        Where they are due, ``grad_norm_encoder`` and so on for every network, before clipping too.
+        """
         params = [p for group in trainer.optimizer.param_groups for p in group["params"]]
         with autocast(params[0].device, self.precision):
-            output = trainer.loss_module(sub_batch)
-        terms = {key: value for key, value in output.items() if key.startswith("loss")}
-        total = sum(terms.values())
-        total.backward()
-        grad_norm = nn.utils.clip_grad_norm_(params, self.clip_norm)
-        if not torch.isfinite(total.detach() + grad_norm):  # the one host synchronisation of a step
+            output = trainer.parallel(sub_batch, trainer._optim_count)
+        sum(_terms(output).values()).backward()
+        norms = module_norms(trainer) if self.norms_due(trainer._optim_count) else {}
+        grad_norm = trainer.parallel.clip(self.clip_norm)
+        output = average(output)
+        terms = _terms(output)
+        if not torch.isfinite(sum(terms.values()) + grad_norm):  # the one host synchronisation of a step
             trainer.optimizer.zero_grad()
             raise FloatingPointError(self._describe(trainer, terms))
         rate = torch.tensor(trainer.optimizer.param_groups[0]["lr"])  # of this update; the schedule moves on afterwards
         trainer.optimizer.step()
         trainer.optimizer.zero_grad()
-        detached = {key: value.detach() for key, value in output.items()}
-        return TensorDict({**detached, "grad_norm": grad_norm.detach(), "learning_rate": rate})
+        trainer.parallel.updated()
+        return TensorDict({**output, **norms, "grad_norm": grad_norm.detach(), "learning_rate": rate})
 
     @staticmethod
     def _describe(trainer: Trainer, terms: dict[str, torch.Tensor]) -> str:
@@ -52,3 +64,17 @@ class OfflineStepper(OptimizationStepper):
         where = f"the last good checkpoint is {last}" if last is not None else "there is no checkpoint yet"
         what = ", ".join(bad) if bad else "the gradient norm, though every loss term is finite"
         return f"step {trainer._optim_count}: not finite: {what}; {where}. Try a smaller learning rate or precision=fp32."
+
+
+def _terms(output: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {key: value for key, value in output.items() if key.startswith("loss")}
+
+
+def module_norms(trainer: Trainer) -> dict[str, torch.Tensor]:
+    """Norm of the gradient of each network of a functional loss, ``grad_norm_encoder`` [] and so on."""
+    norms = {}
+    for name, params in trainer.loss_module.named_children():
+        norm = trainer.parallel.grad_norm(params.parameters()) if name.endswith("_params") else None
+        if norm is not None:
+            norms[f"grad_norm_{name.removesuffix('_params')}"] = norm
+    return norms

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
+
+from torchrl_ficreg.trainers.files import FileWatch
+
+
+class ReadError(OSError):
+    """A batch could not be read. Nothing was learned from it, and the state before it is whole."""
 
 
 class ReplayStream:
@@ -16,16 +23,31 @@ class ReplayStream:
     Args:
         replay_buffer: clips; its ``state_dict`` is a position.
         device: where batches go. Frames travel as uint8.
+
+    Attributes:
+        waited: seconds so far in which a batch was asked for and not yet there.
+
+    Raises:
+        ReadError: a batch could not be read. It does not count as handed out.
     """
 
     init_random_frames = 0
 
     def __init__(self, replay_buffer: ReplayBuffer, device: torch.device) -> None:
         self.replay_buffer, self.device = replay_buffer, device
+        self.waited = 0.0
+        self._files = FileWatch.of(replay_buffer)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         while True:
-            yield self.replay_buffer.sample().to(self.device, non_blocking=True)
+            began = time.perf_counter()
+            try:
+                self._files.check()
+                batch = self.replay_buffer.sample().to(self.device, non_blocking=True)
+            except (OSError, ValueError) as error:
+                raise ReadError(f"the clips cannot be read: {error}") from error
+            self.waited += time.perf_counter() - began
+            yield batch
 
     def state_dict(self) -> dict[str, Any]:
         """The position: batches handed out, and of how many clips and which size."""

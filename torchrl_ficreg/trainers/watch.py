@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -13,19 +14,22 @@ from torchrl_ficreg.modules.precision import autocast, Precision
 from torchrl_ficreg.objectives.base import LatentLoss
 from torchrl_ficreg.objectives.health import latent_health
 from torchrl_ficreg.objectives.sigreg import SIGReg
+from torchrl_ficreg.objectives.vicreg import TemporalStraightness
+from torchrl_ficreg.trainers.distributed import is_main, world_size
 from torchrl_ficreg.trainers.hooks import MetricsTable
 
 
 class LatentAlarm(TrainerHookBase):
     """Logs floor ratio and effective rank of the latents every few steps, and warns when they say collapse.
 
-    See :func:`~torchrl_ficreg.objectives.latent_health`. Nothing about the run is changed by looking: no random
-    number is used up and no running statistic moved.
+    Clips of three frames and more give a third number, ``straightness``: the mean cosine between successive steps in
+    latent space, 1 on a straight path. See :func:`~torchrl_ficreg.objectives.latent_health` for the others. Nothing about
+    the run is changed by looking: no random number is used up and no running statistic moved.
 
     Args:
         interval: steps between looks; the first step is one.
         precision: as in training.
-        table: gets both numbers as columns.
+        table: gets the numbers as columns.
     """
 
     def __init__(self, interval: int, precision: Precision = "auto", table: MetricsTable | None = None) -> None:
@@ -43,9 +47,13 @@ class LatentAlarm(TrainerHookBase):
         with autocast(batch.device or "cpu", self.precision):
             latent = loss.peek(batch)  # [T, B, D]
         health = latent_health(latent, SIGReg().to(latent.device))
-        if health.alarm is not None and step != 1:  # at the very start nothing has been learned yet
+        health = replace(health, samples=health.samples * world_size())  # SIGReg is that of the global batch
+        if health.alarm is not None and step != 1 and is_main():  # at the very start nothing has been learned yet
             torchrl_logger.warning(f"step {step}: {health.alarm}")
-        self._keep({"floor_ratio": health.floor_ratio, "effective_rank": health.effective_rank})
+        numbers = {"floor_ratio": health.floor_ratio, "effective_rank": health.effective_rank}
+        if len(latent) >= 3:
+            numbers["straightness"] = TemporalStraightness()(latent.float().transpose(0, 1)).item()  # [B, T, D] -> []
+        self._keep(numbers)
         return self._numbers
 
     def _keep(self, numbers: dict[str, float]) -> None:

@@ -1,0 +1,202 @@
+"""What a training step costs, measured on this CPU, and what the paper's runs would take on GPUs: docs/results/scaling.json.
+
+Measured: operations, dispatched operators, bytes kept for the backward pass, and seconds of processor time on one
+thread. Modelled: everything about GPUs, by ``step_seconds`` below. No GPU was at hand for it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from step_cost import matrix_rate, operations_of_step, state_bytes, take_step
+from tensordict import TensorDictBase
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from torchrl_ficreg import FICRegLoss, make_world_model, ModelConfig, SIGReg
+from torchrl_ficreg.data import OfflineTrajectories
+from torchrl_ficreg.trainers import OfflineTrainer
+
+RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "scaling.json"
+FRAMES, ACTIONS, BATCH, EPOCHS = 4, 2, 128, 10
+# Clips of 4 frames, 5 steps apart, in the published data, and latents a predictor sees there.
+CLIPS = {"two_room": (730_809, 1), "push_t": (1_981_721, 3), "reacher": (1_820_000, 3), "cube": (1_820_000, 3)}
+PRESETS = {
+    "cpu": ModelConfig.preset("cpu"),
+    "gpu_short": ModelConfig.preset("paper", image_size=112),
+    "paper": ModelConfig.preset("paper"),
+    "paper, two_room": ModelConfig.preset("paper", history=1),
+}
+# The model of a GPU: dense bf16 peak and memory bandwidth between GPUs by their data sheets; the rest is assumed.
+GPU = {
+    "name": "H100 or H200 SXM",
+    "peak": 990e12,  # operations per second
+    "share": 0.2,  # of the peak, reached by the matrix products of a step with all its other work in between
+    "launch": 4e-6,  # seconds in which a host starts one operator; CUDA graphs take most of it away
+    "bandwidth": 200e9,  # bytes per second of an all-reduce, within a machine
+    "bandwidth_between_machines": 40e9,  # of 8 GPUs each
+}
+
+
+def main() -> None:
+    """Measures, models, prints and writes."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--quick", action="store_true", help="smallest sizes only, to see it run")
+    parser.add_argument("--out", type=Path, default=RESULT)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    repeats, paper = arguments.repeats, PRESETS["paper"]
+    sizes = (28, 56) if arguments.quick else (56, 112, 168, 224)
+    small = ModelConfig.preset("paper", image_size=28) if arguments.quick else ModelConfig.preset("paper", image_size=112)
+    measured = {
+        "batch": [measure(small, clips, repeats) for clips in (2, 4, 8)],
+        "resolution": [measure(ModelConfig.preset("paper", image_size=size), 2, repeats) for size in sizes],
+        "predictor": [measure(replace_depth(small, depth), 2, repeats) for depth in (2, 6, 12)],
+    }
+    presets = {"cpu": PRESETS["cpu"]} if arguments.quick else PRESETS
+    measured["presets"] = {name: measure(config, 2, repeats) for name, config in presets.items()}
+    result = {
+        "measured": measured,
+        "modelled": {"gpu": GPU, "memory": memory(measured["presets"]), "runs": runs(measured["presets"])},
+        "machine": {
+            "processor": platform.machine(),
+            "threads": 1,
+            "torch": torch.__version__,
+            "matrix_operations_per_second": matrix_rate(torch.device("cpu"), size=1024),
+        },
+        "settings": {"paper_parameters": parameters(paper), "repeats": repeats, "seed": 0},
+    }
+    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+    report(result)
+
+
+def replace_depth(config: ModelConfig, depth: int) -> ModelConfig:
+    """The same model with another number of predictor layers."""
+    return ModelConfig(**{**vars(config), "predictor_depth": depth})
+
+
+def parameters(config: ModelConfig) -> int:
+    """Of the world model."""
+    return sum(p.numel() for p in make_world_model(config, ACTIONS)[0].parameters())
+
+
+def measure(config: ModelConfig, clips: int, repeats: int) -> dict[str, Any]:
+    """One FICReg step of a few random clips on the CPU."""
+    torch.manual_seed(0)
+    rng, rows, size = np.random.default_rng(0), 5 * config.history + 1, config.image_size
+    episodes = [
+        {
+            "pixels": rng.integers(0, 256, (rows, 3, size, size), dtype=np.uint8),
+            "action": np.pad(rng.normal(size=(rows - 1, ACTIONS)), ((0, 1), (0, 0))).astype(np.float32),
+            "state": np.zeros((rows, 1)),
+        }
+        for _ in range(clips)
+    ]
+    data = OfflineTrajectories.from_episodes(
+        episodes, split="all", num_frames=config.history + 1, frame_skip=5, batch_size=clips
+    )
+    model, inverse_model = make_world_model(config, ACTIONS)
+    loss = FICRegLoss(model.encoder, model.predictor, inverse_model, sigreg=SIGReg(seed=0))
+    trainer = OfflineTrainer(loss, data, epochs=1, progress_bar=False)
+    clip = data.sample()
+    kept = kept_bytes(trainer, clip)
+    with _Dispatched() as dispatched:
+        take_step(trainer, clip)
+    times = []
+    for _ in range(repeats):
+        began = time.process_time()
+        take_step(trainer, clip)
+        times.append(time.process_time() - began)
+    return {
+        "image_size": size,
+        "clips": clips,
+        "frames": clips * (config.history + 1),
+        "predictor_depth": config.predictor_depth,
+        "cpu_seconds": min(times),
+        "operations": operations_of_step(trainer, clip),
+        "operators": dispatched.count,
+        "kept_bytes": kept,
+        "state_bytes": state_bytes(trainer),
+    }
+
+
+def kept_bytes(trainer: OfflineTrainer, clip: TensorDictBase) -> int:
+    """Bytes that the forward pass keeps for the backward pass, the weights apart; each storage once."""
+    weights = {p.untyped_storage().data_ptr() for p in trainer.loss_module.parameters()}
+    kept: dict[int, int] = {}
+
+    def pack(tensor: torch.Tensor) -> torch.Tensor:
+        storage = tensor.untyped_storage()
+        if storage.data_ptr() not in weights:
+            kept[storage.data_ptr()] = storage.nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        take_step(trainer, clip)
+    return sum(kept.values())
+
+
+class _Dispatched(TorchDispatchMode):
+    """Counts the operators of a step that are not mere views: on a GPU most are a kernel each, unless compiled."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += not func.is_view
+        return func(*args, **(kwargs or {}))
+
+
+def step_seconds(row: dict[str, Any], gpus: int) -> float:
+    """Modelled seconds of one step of 128 clips on some GPUs: the slower of computing and launching, then all-reduce."""
+    compute = row["operations"] / row["clips"] * BATCH / gpus / (GPU["peak"] * GPU["share"])
+    launch = row["operators"] * GPU["launch"]
+    gradients = row["state_bytes"] / 4
+    rate = GPU["bandwidth"] if gpus <= 8 else GPU["bandwidth_between_machines"]
+    reduce = 0.0 if gpus == 1 else 2 * gradients * (gpus - 1) / gpus / rate
+    return max(compute, launch) + reduce
+
+
+def memory(presets: dict[str, dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Modelled bytes of training with 128 clips on one GPU: what was measured for two clips, scaled."""
+    return {
+        name: {"state": row["state_bytes"], "activations": row["kept_bytes"] / row["clips"] * BATCH}
+        for name, row in presets.items()
+    }
+
+
+def runs(presets: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Modelled hours of the paper's ten epochs on 1, 8 and 64 GPUs."""
+    result = {}
+    for env, (clips, history) in CLIPS.items():
+        row = presets.get("paper" if history == FRAMES - 1 else "paper, two_room")
+        if row is None:
+            continue
+        steps = EPOCHS * (clips // BATCH)
+        hours = {gpus: steps * step_seconds(row, gpus) / 3600 for gpus in (1, 8, 64)}
+        loader = {gpus: BATCH / step_seconds(row, gpus) for gpus in (1, 8, 64)}
+        result[env] = {"steps": steps, "hours": hours, "clips_per_second": loader}
+    return result
+
+
+def report(result: dict[str, Any]) -> None:
+    """Prints the tables."""
+    for title, rows in result["measured"].items():
+        print(f"\n{title}: px, clips, frames, predictor layers, s, GFLOP, operators, MB kept")
+        for row in rows.values() if isinstance(rows, dict) else rows:
+            print(
+                f"  {row['image_size']:>4}{row['clips']:>4}{row['frames']:>5}{row['predictor_depth']:>4}"
+                f"{row['cpu_seconds']:>9.3f}{row['operations'] / 1e9:>9.1f}{row['operators']:>7}"
+                f"{row['kept_bytes'] / 1e6:>9.1f}"
+            )
+    print(json.dumps(result["modelled"], indent=1))
+
+
+if __name__ == "__main__":
+    main()

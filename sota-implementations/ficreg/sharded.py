@@ -1,0 +1,69 @@
+"""Recording with TorchRL's collectors: a folder of shards instead of one dataset, opened the same way."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from torchrl_ficreg.data import EpisodeWriter
+from torchrl_ficreg.data.shards import open_store, SHARD, shard_paths
+from torchrl_ficreg.envs.collect import EpisodeRecorder
+from torchrl_ficreg.envs.collectors import collect_shards
+from torchrl_ficreg.envs.registry import find_entry
+
+
+def record_shards(cfg: DictConfig, path: Path, meta: dict[str, Any]) -> Path:
+    """Records what the shards of a dataset still lack, which may be nothing, and returns their folder.
+
+    Shard w of W holds the episodes w, w + W, ...: opened together they are the dataset of one process.
+
+    Raises:
+        ValueError: shards are there, unfinished, and no collector is named to go on with.
+    """
+    count = open_store(path, allow_incomplete=True).header.meta["shards"] if shard_paths(path) else cfg.collect.num_workers
+    shares = [range(shard, cfg.env.data.episodes, count) for shard in range(max(1, count))]
+    with contextlib.ExitStack() as stack:
+        writers = [
+            stack.enter_context(
+                EpisodeWriter(
+                    path / SHARD.format(shard),
+                    target_episodes=len(share),
+                    meta={**meta, "shards": len(shares)},
+                    frames=cfg.collect.frames,
+                    wait=True,
+                )
+            )
+            for shard, share in enumerate(shares)
+        ]
+        left = [share[writer.num_episodes :] for share, writer in zip(shares, writers)]
+        if not any(left):
+            return path
+        if cfg.collect.collector is None:
+            raise ValueError(f"{path} holds unfinished shards: give collect.collector=async, which continues them.")
+        done = sum(writer.num_episodes for writer in writers)
+        episodes = collect_shards(
+            recorder(cfg), left, kind=cfg.collect.collector, options=OmegaConf.to_container(cfg.collect.options)
+        )
+        with tqdm(total=cfg.env.data.episodes, initial=done, desc="collect", unit="episode", dynamic_ncols=True) as bar:
+            for shard, episode in episodes:
+                writers[shard].append(episode)
+                bar.update()
+    return path
+
+
+def recorder(cfg: DictConfig) -> EpisodeRecorder:
+    """What an episode of a configuration is."""
+    data = cfg.env.data
+    env_kwargs = {**OmegaConf.to_container(cfg.env.kwargs), **OmegaConf.to_container(data.kwargs)}
+    return EpisodeRecorder(
+        entry=find_entry(cfg.env.name),
+        seed=data.seed,
+        max_steps=data.max_steps,
+        stop_at_success=data.stop_at_success,
+        expert_kwargs=OmegaConf.to_container(data.expert),
+        env_kwargs={"image_size": cfg.model.image_size, **env_kwargs},
+    )

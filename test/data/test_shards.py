@@ -1,0 +1,110 @@
+"""Shards recorded side by side are the dataset that one writer would have made."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, OfflineTrajectories
+from torchrl_ficreg.data.shards import open_store, ShardedStore
+
+LENGTHS = [20, 31, 25, 40, 22, 28, 33]  # of episodes 1 to 7: shards of three, two and two
+
+
+@pytest.fixture
+def sharded(tmp_path, make_episode, meta) -> Callable[..., Path]:
+    """``sharded(3)`` writes the episodes in turn into three shards and returns their folder."""
+
+    def write(count: int, frames: str = "raw", shards: Sequence[int] | None = None) -> Path:
+        for shard in range(count) if shards is None else shards:
+            mine = range(shard, len(LENGTHS), count)
+            path = tmp_path / "dataset" / f"shard-{shard}"
+            settings = {"target_episodes": len(mine), "meta": {**meta, "shards": count}, "frames": frames}
+            with EpisodeWriter(path, **settings) as writer:
+                for index in mine:
+                    writer.append(make_episode(index + 1, LENGTHS[index]))
+        return tmp_path / "dataset"
+
+    return write
+
+
+@pytest.fixture
+def whole(record) -> Path:
+    """The same episodes from one writer."""
+    return record(LENGTHS)
+
+
+@pytest.mark.parametrize("frames", ["raw", "png"])
+def test_shards_are_the_dataset_of_one_writer(sharded, whole, frames):
+    ours, theirs = open_store(sharded(3, frames)), EpisodeStore.open(whole)
+    assert isinstance(ours, ShardedStore)
+    assert ours.fingerprint == theirs.fingerprint
+    assert ours.start.tolist() == theirs.start.tolist() and ours.length.tolist() == theirs.length.tolist()
+    for key in ("action", "state"):
+        assert np.array_equal(ours.arrays[key], theirs.arrays[key])
+    scattered = np.random.default_rng(0).integers(0, ours.num_steps, (5, 4))
+    for rows in (scattered, slice(3, 9), slice(0, ours.num_steps, 7), slice(15, 25), slice(9, 3)):
+        assert np.array_equal(ours.frames(rows), theirs.frames(rows))
+
+
+def test_their_clips_come_in_the_same_order(sharded, whole):
+    settings = {"num_frames": 3, "frame_skip": 4, "batch_size": 8, "keys": ("pixels", "action", "state", "episode")}
+    ours, theirs = OfflineTrajectories(sharded(2), **settings), OfflineTrajectories(whole, **settings)
+    assert len(ours) == len(theirs)
+    for _ in range(4):
+        assert (ours.sample() == theirs.sample()).all()
+    assert torch.equal(ours.statistics.mean, theirs.statistics.mean)
+
+
+def test_a_list_of_folders_is_one_dataset_too(sharded, whole):
+    folder = sharded(3)
+    dataset = OfflineTrajectories([folder / f"shard-{n}" for n in range(3)], num_frames=2)
+    assert dataset.fingerprint == OfflineTrajectories(whole, num_frames=2).fingerprint
+
+
+def test_more_than_ten_shards_keep_their_order(sharded):
+    store = open_store(sharded(12, shards=range(len(LENGTHS))), allow_incomplete=True)
+    assert store.length.tolist() == LENGTHS
+
+
+def test_a_frame_slice_within_an_episode_is_not_copied(sharded):
+    store = open_store(sharded(3))
+    assert not store.frames(slice(22, 30)).flags.owndata
+
+
+def test_it_travels_to_another_process_as_paths(sharded):
+    store = open_store(sharded(3))
+    packed = pickle.dumps(store)
+    assert np.array_equal(pickle.loads(packed).frames(np.arange(50)), store.frames(np.arange(50)))
+    assert len(packed) < store.num_steps * 48  # its frames alone are that large
+
+
+def test_a_missing_shard_is_noticed(sharded):
+    folder = sharded(3, shards=[0, 2])
+    with pytest.raises(ValueError, match="holds 2 of 3 shards: collect the rest"):
+        OfflineTrajectories(folder)
+
+
+def test_shards_of_different_settings_are_refused(sharded, record):
+    folder = sharded(1)
+    with pytest.raises(ValueError, match="shards must agree in their meta"):
+        open_store([folder / "shard-0", record([20])])
+    with pytest.raises(ValueError, match="at least one directory"):
+        open_store([])
+
+
+def test_a_row_outside_is_an_error(sharded):
+    store = open_store(sharded(3))
+    for row in (-1, store.num_steps):
+        with pytest.raises(IndexError, match="rows run from 0"):
+            store.frames(np.array([row]))
+
+
+def test_no_dataset_at_all_says_so(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no dataset at"):
+        open_store(tmp_path)

@@ -1,0 +1,98 @@
+"""Named experiments are whole sets of runs, and a sweep keeps every run in a folder of its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import MissingConfigException
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from omegaconf import DictConfig
+
+CONFIG = Path(__file__).resolve().parents[2] / "sota-implementations" / "ficreg" / "config"
+ENVIRONMENTS = ("two_room", "push_t", "reacher", "cube")
+
+
+def config(*overrides: str, hydra: bool = False) -> DictConfig:
+    with initialize_config_dir(str(CONFIG), version_base="1.3"):
+        return compose("train", list(overrides), return_hydra_config=hydra)
+
+
+def runs(*overrides: str) -> list[list[str]]:
+    """The runs that ``python train.py -m`` would start, as Hydra's own sweeper lists them."""
+    params = config(*overrides[:1], hydra=True).hydra.sweeper.params
+    parsed = OverridesParser.create().parse_overrides([*(f"{key}={value}" for key, value in params.items()), *overrides])
+    return BasicSweeper.split_arguments(parsed, None)[0]
+
+
+@pytest.mark.parametrize("method", ["ficreg", "lewm"])
+def test_an_experiment_is_four_environments_times_three_seeds(method):
+    found = runs(f"experiment={method}_paper")
+    assert len(found) == 12
+    names = {config(*overrides).name for overrides in found}
+    assert names == {f"{env}_paper_{method}_seed{seed}" for env in ENVIRONMENTS for seed in range(3)}
+
+
+def test_the_command_line_narrows_it_down():
+    assert len(runs("experiment=ficreg_paper", "env=push_t", "seed=0,1")) == 2
+
+
+def test_without_m_an_experiment_is_one_run():
+    cfg = config("experiment=lewm_paper", "env=push_t", "seed=2")
+    assert (cfg.env.name, cfg.model.preset, cfg.method.name, cfg.seed) == ("push_t", "paper", "lewm", 2)
+
+
+@pytest.mark.parametrize("env", ENVIRONMENTS)
+def test_the_papers_recipe_to_the_letter(env):
+    """Numbers of arXiv 2603.19312 and of FICReg's appendix; where code and text differ, those of the code."""
+    cfg = config("model=paper", f"env={env}")
+    model, optim, plan = cfg.model, cfg.optim, cfg.plan
+    assert (model.encoder, model.image_size, model.latent_dim, model.frame_skip) == ("vit", 224, 192, 5)
+    assert model.history == (1 if env == "two_room" else 3)
+    assert (model.predictor_depth, model.predictor_heads, model.predictor_dim_head) == (6, 16, 64)
+    assert (model.predictor_mlp_dim, model.predictor_dropout, model.inverse_hidden_dim) == (2048, 0.1, 512)
+    assert (optim.batch_size, optim.epochs, optim.lr, optim.weight_decay) == (128, 10, 5e-5, 1e-3)
+    assert (optim.clip_norm, optim.warmup) == (1.0, 0.01)
+    assert (cfg.loss.sigreg_coeff, cfg.loss.idm_coeff, cfg.loss.consistency_coeff) == (0.09, 0.1, 0.1)
+    assert (plan.num_candidates, plan.num_elites, plan.iterations) == (300, 30, 30 if env == "push_t" else 10)
+    assert (plan.horizon, plan.receding_horizon, plan.std, plan.bounds) == (5, 5, 1.0, "none")
+    assert plan.history == "one_frame"
+    assert (cfg.env.goal_offset, cfg.env.budget) == (25, 50)
+    assert cfg.env.data.episodes == (18685 if env == "push_t" else 10000)
+
+
+def test_an_environments_wishes_hold_against_the_common_file():
+    assert config("env=push_t").refine.steps == 3000
+    assert config("env=push_t", "refine.steps=0").refine.steps == 0
+
+
+def test_the_papers_planning_belongs_to_cem_alone():
+    assert config("model=paper", "env=push_t", "plan=policy").plan.bounds == "environment"
+
+
+@pytest.mark.parametrize(
+    ("launcher", "plugin"), [("slurm", "hydra_submitit_launcher"), ("processes", "hydra_joblib_launcher")]
+)
+def test_launchers_are_known_and_name_what_they_need(launcher, plugin):
+    """With its package a launcher is Hydra's; without it Hydra says which option is missing."""
+    try:
+        cfg = config(f"hydra/launcher={launcher}", hydra=True)
+    except MissingConfigException as error:
+        assert {"slurm": "submitit_slurm", "processes": "joblib"}[launcher] in str(error)
+    else:
+        assert plugin in cfg.hydra.launcher._target_
+
+
+def test_a_sweep_over_seeds_makes_a_run_of_each(command, environment, tmp_path):
+    line = command("train.py", "seed=0,1", "evaluation.num_pairs=2", "evaluation.record=1", "-m")
+    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    folders = sorted(path.name for path in (tmp_path / "runs").iterdir() if path.is_dir())
+    assert folders == ["two_room_cpu_ficreg_seed0", "two_room_cpu_ficreg_seed1"]
+    results = [json.loads((tmp_path / "runs" / name / "results.json").read_text()) for name in folders]
+    assert results[0]["ficreg"]["pairs_hash"] == results[1]["ficreg"]["pairs_hash"]
+    assert (tmp_path / "runs" / folders[0] / "checkpoints").is_dir()

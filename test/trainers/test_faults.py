@@ -1,0 +1,299 @@
+"""Whatever fails around a run, it stops or goes on as documented, and the last good state is whole.
+
+Every fault is a real one: the system refuses to let a file grow, files are cut or removed, processes are killed.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import multiprocessing
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import pytest
+import torch
+from test_killed_runs import half_written
+from tiny import make_trainer, record, run_until_told, same, weights
+from torchrl import torchrl_logger
+from torchrl.checkpoint import Checkpoint
+from torchrl.record.loggers import get_logger
+
+from torchrl_ficreg.data import EpisodeWriter, OfflineTrajectories
+from torchrl_ficreg.trainers import find_checkpoint, load_world_model, Preempted, PREEMPTED, ReadError, stop_on_signal
+
+
+@pytest.fixture(scope="module")
+def unbroken():
+    """Weights of a run that nothing happened to."""
+    trainer = make_trainer()
+    trainer.train()
+    return weights(trainer)
+
+
+@pytest.fixture
+def warnings(monkeypatch):
+    """Every warning of the run."""
+    said = []
+    monkeypatch.setattr(torchrl_logger, "warning", lambda text, *_: said.append(text))
+    return said
+
+
+@contextmanager
+def no_file_may_exceed(size: int):
+    """What a full disk does to a growing file: a part is written, the rest is an OSError."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def at_step(trainer, step: int, action) -> None:
+    """Does something between two steps."""
+    trainer.register_op("post_steps", lambda: action() if trainer.step == step else None)
+
+
+def steps(run_dir) -> list[int]:
+    rows = csv.DictReader((run_dir / "metrics.csv").read_text().splitlines())
+    return [int(row["step"]) for row in rows if row["split"] == "train"]
+
+
+@pytest.mark.parametrize("size", [2_000, 20_000], ids=["under the weights", "under the archive"])
+def test_a_disk_that_fills_up_while_a_checkpoint_is_written_stops_the_run(tmp_path, unbroken, size):
+    """The checkpoint before is whole, nothing half-written stays, and the same command ends with the same weights."""
+    trainer, limits = make_trainer(tmp_path, log_interval=100), resource.getrlimit(resource.RLIMIT_FSIZE)
+    at_step(trainer, 17, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1])))
+    with no_file_may_exceed(limits[0]), pytest.raises(OSError, match="step 18 cannot be written .*make room"):
+        trainer.train()
+    assert not half_written(tmp_path)
+    load_world_model(tmp_path)
+    again = make_trainer(tmp_path, log_interval=100)
+    assert again.resume() and again.step == 9
+    again.train()
+    assert same(weights(again), unbroken)
+
+
+def test_a_disk_that_is_nearly_full_is_noticed_before_anything_is_written(tmp_path, monkeypatch):
+    """A memory map that outgrows its disk is SIGBUS, so room is asked for first."""
+    import shutil
+
+    trainer = make_trainer(tmp_path, epochs=1)
+    full = shutil.disk_usage(tmp_path)._replace(free=1000)
+    at_step(trainer, 8, lambda: monkeypatch.setattr(shutil, "disk_usage", lambda place: full))
+    with pytest.raises(OSError, match="no room for a checkpoint .* MB needed"):
+        trainer.train()
+    assert not list((tmp_path / "checkpoints").iterdir())
+
+
+def test_rows_of_metrics_wait_until_there_is_room(tmp_path, unbroken, warnings):
+    """One warning; half a row is taken back at once; in the end no row is missing and the weights are the same."""
+    trainer = make_trainer(tmp_path, log_interval=1)
+    table, limits = tmp_path / "metrics.csv", resource.getrlimit(resource.RLIMIT_FSIZE)
+    whole = []
+
+    def fill() -> None:
+        whole.append(table.read_bytes())
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole[0]) + 20, limits[1]))
+
+    def free() -> None:
+        assert table.read_bytes() == whole[0]
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+    at_step(trainer, 2, fill)
+    at_step(trainer, 6, free)
+    with no_file_may_exceed(limits[0]):
+        trainer.train()
+    assert len(warnings) == 1 and "rows wait in memory" in warnings[0]
+    assert steps(tmp_path) == [*range(1, 28)]
+    assert same(weights(trainer), unbroken)
+
+
+@pytest.fixture
+def on_disk(tmp_path):
+    """``on_disk(frames)`` records the tiny episodes and opens them as training clips."""
+
+    def open_clips(frames: str) -> OfflineTrajectories:
+        folder = tmp_path / "data"
+        if not folder.exists():
+            episodes = record()
+            with EpisodeWriter(folder, target_episodes=len(episodes), meta={}, frames=frames) as writer:
+                for episode in episodes:
+                    writer.append(episode)
+        return OfflineTrajectories(folder, num_frames=2, frame_skip=2, batch_size=16)
+
+    return open_clips
+
+
+@pytest.mark.parametrize("frames", ["raw", "png"])
+def test_a_data_file_cut_short_stops_the_run_with_a_checkpoint_of_that_step(tmp_path, on_disk, unbroken, frames):
+    """Without a look before each batch, the next page touched would be SIGBUS. Restored, the run ends as it should."""
+    trainer = make_trainer(tmp_path / "run", data=on_disk(frames))
+    (file,) = (tmp_path / "data").glob("pixels.memmap" if frames == "raw" else "pixels.blob")
+    whole = file.read_bytes()
+    at_step(trainer, 13, lambda: os.truncate(file, 1000))
+    with pytest.raises(ReadError, match=f"{file.name} has shrunk from {len(whole)} to 1000 bytes: restore it"):
+        trainer.train()
+    with pytest.raises(ValueError, match="damaged"):
+        on_disk(frames)
+    file.write_bytes(whole)
+    again = make_trainer(tmp_path / "run", data=on_disk(frames))
+    assert again.resume() and again.step == 13
+    again.train()
+    assert same(weights(again), unbroken)
+
+
+def test_a_damaged_image_stops_the_run_with_a_checkpoint_of_that_step(tmp_path, on_disk, unbroken):
+    """The prefetching thread meets it; its error arrives, and the batches before it were trained on."""
+    clips = on_disk("png")
+    trainer = make_trainer(tmp_path / "run", data=clips)
+    file = tmp_path / "data" / "pixels.blob"
+    whole = file.read_bytes()
+    at_step(trainer, 13, lambda: file.write_bytes(bytes(len(whole))))
+    with pytest.raises(ReadError, match="the clips cannot be read: .*image"):
+        trainer.train()
+    file.write_bytes(whole)
+    again = make_trainer(tmp_path / "run", data=on_disk("png"))
+    assert again.resume() and again.step == 13
+    again.train()
+    assert same(weights(again), unbroken)
+
+
+def test_a_vanished_data_file_lets_this_process_finish_and_the_next_one_say_so(tmp_path, on_disk, unbroken, warnings):
+    """The mapping keeps the bytes."""
+    trainer = make_trainer(tmp_path / "run", data=on_disk("raw"))
+    at_step(trainer, 13, (tmp_path / "data" / "pixels.memmap").unlink)
+    trainer.train()
+    assert same(weights(trainer), unbroken)
+    assert len(warnings) == 1 and "pixels.memmap has vanished" in warnings[0]
+    with pytest.raises(ValueError, match="pixels.memmap is damaged"):
+        on_disk("raw")
+
+
+def test_after_a_nan_the_last_checkpoint_continues_as_if_nothing_had_happened(tmp_path, unbroken):
+    trainer = make_trainer(tmp_path)
+    at_step(trainer, 12, lambda: next(trainer.loss_module.encoder_params.parameters()).data.fill_(math.nan))
+    with pytest.raises(FloatingPointError, match="step 13: not finite: .*; the last good checkpoint is "):
+        trainer.train()
+    again = make_trainer(tmp_path)
+    assert again.resume() and again.step == 9
+    again.train()
+    assert same(weights(again), unbroken)
+
+
+def test_a_logger_that_fails_in_the_middle_is_given_up_with_one_warning(tmp_path, unbroken, warnings):
+    """Its files may not grow any more. The run ends as it would have, and its checkpoints know nothing of the logger."""
+    logger = get_logger("csv", logger_name=str(tmp_path / "log"), experiment_name="run")
+    trainer = make_trainer(tmp_path / "run", logger=logger, log_interval=1)
+    limit, log_scalar = resource.getrlimit(resource.RLIMIT_FSIZE)[0], logger.log_scalar
+
+    def full_disk(*args, **kwargs):
+        with no_file_may_exceed(1 if trainer.step >= 5 else limit):
+            log_scalar(*args, **kwargs)
+
+    logger.log_scalar = full_disk
+    trainer.train()
+    assert same(weights(trainer), unbroken)
+    assert len(warnings) == 1 and "CSVLogger is lost (OSError" in warnings[0]
+    assert steps(tmp_path / "run") == [*range(1, 28)]
+    assert "logger" not in Checkpoint.manifest(trainer.checkpoint_rotation.latest())["components"]
+    assert make_trainer(tmp_path / "run").resume(), "without a logger, too"
+
+
+WANDB = """
+import os, signal, subprocess
+from pathlib import Path
+from tiny import make_trainer, weights
+import torch
+from torchrl.record.loggers import get_logger
+
+here = Path.cwd()
+logger = get_logger("wandb", logger_name=str(here), experiment_name="run", wandb_kwargs={"mode": "offline"})
+trainer = make_trainer(logger=logger, log_interval=1)
+tasks = Path(f"/proc/{os.getpid()}/task").glob("*/children")
+children = [int(pid) for file in tasks for pid in file.read_text().split()]
+service = [pid for pid in children if b"wandb" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+assert service
+trainer.register_op("post_steps", lambda: trainer.step == 5 and os.kill(service[0], signal.SIGKILL))
+trainer.train()
+assert trainer.logger.lost
+torch.save(weights(trainer), here / "weights.pt")
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for the service below /proc")
+def test_a_run_outlives_the_service_of_wandb(tmp_path, unbroken):
+    """Killed in the middle, in a process of its own, where it can disturb nobody else."""
+    pytest.importorskip("wandb")
+    paths = os.pathsep.join([os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")])
+    env = {**os.environ, "PYTHONPATH": paths, "WANDB_MODE": "offline", "WANDB_X_SERVICE_WAIT": "120"}
+    done = subprocess.run(
+        [sys.executable, "-c", WANDB], cwd=tmp_path, env=env, capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("WandbLogger is lost") + done.stdout.count("WandbLogger is lost") == 1
+    assert same(torch.load(tmp_path / "weights.pt"), unbroken)
+
+
+def test_sigterm_stops_after_the_step_in_progress_and_the_repeated_command_changes_no_bit(tmp_path, unbroken):
+    """Sent in the middle of steps 5 and 14, which end no epoch; afterwards the signal means what it meant before."""
+    handler = signal.getsignal(signal.SIGTERM)
+    for stop_at in (5, 14):
+        trainer = make_trainer(tmp_path)
+        trainer.resume()
+        send = lambda batch, t=trainer, at=stop_at: os.kill(os.getpid(), signal.SIGTERM) if t.step == at else None  # noqa: E731
+        trainer.register_op("post_optim_log", send)
+        with pytest.raises(Preempted, match="stopped by SIGTERM: the same command continues") as caught:
+            with stop_on_signal(trainer):
+                trainer.train()
+        assert caught.value.code == PREEMPTED == 85
+        assert trainer.step == stop_at
+        assert signal.getsignal(signal.SIGTERM) is handler
+    again = make_trainer(tmp_path)
+    assert again.resume() and again.step == 14
+    with stop_on_signal(again):
+        again.train()
+    assert same(weights(again), unbroken)
+    assert steps(tmp_path) == [4, 8, 12, 16, 20, 24, 27]
+
+
+def test_preempted_at_any_moment_a_process_exits_with_85_and_what_it_learned_is_kept(tmp_path):
+    """Five lives, ended by the clock. The last checkpoint has the weights of a run that took so many steps at once."""
+    context, chance, reached = multiprocessing.get_context("forkserver"), random.Random(0), 0
+    context.set_forkserver_preload(["torchrl_ficreg.trainers"])
+    for _ in range(5):
+        process = context.Process(target=run_until_told, args=(tmp_path / "run",))
+        process.start()
+        while process.is_alive() and not (tmp_path / f"listens{reached}").exists():
+            time.sleep(0.001)
+        process.join(chance.uniform(0, 0.1))
+        process.terminate()
+        process.join(60)
+        assert process.exitcode == 85
+        before, reached = reached, Checkpoint.manifest(find_checkpoint(tmp_path / "run"))["metadata"]["optim_steps"]
+        assert reached > before
+    last = make_trainer(tmp_path / "run", validate=False, epochs=60)
+    assert last.resume() and last.step == reached
+    whole = make_trainer(validate=False, epochs=60)
+    at_step(whole, reached, whole.request_stop)
+    whole.train()
+    assert same(weights(last), weights(whole))
+
+
+def test_a_run_may_begin_from_the_checkpoint_of_another(tmp_path, unbroken):
+    """It then has checkpoints of its own, and those are what continues."""
+    make_trainer(tmp_path / "first").train()
+    earlier, _ = sorted((tmp_path / "first" / "checkpoints").iterdir())
+    second = make_trainer(tmp_path / "second")
+    assert second.resume(earlier) and second.step == 18
+    second.train()
+    assert same(weights(second), unbroken)
+    again = make_trainer(tmp_path / "second")
+    assert again.resume(earlier) and again.step == 27

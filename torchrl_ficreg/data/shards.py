@@ -1,0 +1,143 @@
+"""Several dataset directories opened as one: what processes or machines recorded side by side.
+
+::
+
+    <dataset>/
+      shard-0/           episodes 1, 4, 7, ...    each shard a dataset of its own, made by one EpisodeWriter
+      shard-1/           episodes 2, 5, 8, ...
+      shard-2/           episodes 3, 6, 9, ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_ficreg.data.layout import INDEX_FILE, META_FILE, parse_index
+from torchrl_ficreg.data.schema import PIXELS
+from torchrl_ficreg.data.store import EpisodeStore, Verify
+
+SHARD = "shard-{}"
+
+
+def open_store(
+    path: str | Path | Sequence[str | Path],
+    *,
+    allow_incomplete: bool = False,
+    verify: Verify = "ends",
+    num_threads: int | None = None,
+) -> EpisodeStore:
+    """Opens a dataset directory, a directory of shards, or a list of directories.
+
+    Args:
+        path: one of the three.
+        allow_incomplete: see :meth:`EpisodeStore.open`.
+        verify: see :meth:`EpisodeStore.open`; of each shard.
+        num_threads: see :meth:`EpisodeStore.open`.
+
+    Raises:
+        FileNotFoundError: there is no dataset.
+        ValueError: one is damaged or incomplete, or they differ in their frames, row shapes or what they note.
+    """
+    options = {"allow_incomplete": allow_incomplete, "verify": verify, "num_threads": num_threads}
+    folder = Path(path) if isinstance(path, (str, Path)) else None
+    paths = [Path(shard) for shard in path] if folder is None else shard_paths(folder)
+    if folder is not None and (not paths or (folder / META_FILE).exists()):
+        return EpisodeStore.open(folder, **options)
+    if not paths:
+        raise ValueError("a dataset needs at least one directory, got an empty list.")
+    store = ShardedStore([EpisodeStore.open(shard, **options) for shard in paths], folder)
+    want = store.header.meta.get("shards", len(paths))
+    if len(paths) != want and not allow_incomplete:
+        raise ValueError(f"{path} holds {len(paths)} of {want} shards: collect the rest, or pass allow_incomplete=True.")
+    return store
+
+
+def shard_paths(folder: Path) -> list[Path]:
+    """The shards of a directory, by number: those that have begun."""
+    found = [path.parent for path in folder.glob(f"{SHARD.format('*')}/{META_FILE}")]
+    return sorted(found, key=lambda path: int(path.name.rpartition("-")[2]))
+
+
+class ShardedStore(EpisodeStore):
+    """The episodes of several stores, one of each in turn, as if they had been recorded in that order.
+
+    W processes of which number w records the episodes w, w + W, w + 2 W, ... thus make the very dataset that one
+    process makes: same episode ids, hence same splits and clips, and same fingerprint. Actions and states are copied
+    into memory; frames stay where they are.
+
+    Args:
+        shards: opened stores.
+        path: the directory that holds them, if one does; frozen start-goal pairs are kept there.
+
+    Raises:
+        ValueError: the shards differ in their frames, row shapes or what they note.
+    """
+
+    def __init__(self, shards: Sequence[EpisodeStore], path: Path | None = None) -> None:
+        first = shards[0].header
+        for shard in shards[1:]:
+            for name in ("frames", "shapes", "meta"):
+                ours, theirs = getattr(first, name), getattr(shard.header, name)
+                if ours != theirs:
+                    raise ValueError(
+                        f"shards must agree in their {name}: {shards[0].path} has {ours}, {shard.path} has {theirs}. "
+                        "Open them as datasets of their own."
+                    )
+        self.shards = list(shards)
+        # Stable: by place within the shard, then by shard.
+        turns = sorted((place, number) for number, shard in enumerate(shards) for place in range(shard.num_episodes))
+        self._shard = np.array([number for _, number in turns])  # [E]
+        self._first = np.array([shards[number].start[place] for place, number in turns])  # [E], row within the shard
+        entries, row = [], 0
+        indices = [_index(shard) for shard in shards]
+        for episode, (place, number) in enumerate(turns, start=1):
+            entries.append(indices[number][place]._replace(episode=episode, start=row))
+            row = entries[-1].stop
+        header = replace(first, target_episodes=sum(shard.header.target_episodes for shard in shards))
+        super().__init__(header, entries, None, path)
+
+    def frames(self, rows: slice | np.ndarray) -> np.ndarray:
+        """As :meth:`EpisodeStore.frames`; a slice is not copied where it lies within one episode."""
+        if isinstance(rows, slice):
+            start, stop, step = rows.indices(self.num_steps)
+            inside = step > 0 and start < stop
+            episode = self._episode_of(np.array(start)) if inside else 0
+            if inside and stop <= self.start[episode] + self.length[episode]:
+                shift = self._first[episode] - self.start[episode]
+                return self.shards[self._shard[episode]].frames(slice(start + shift, stop + shift, step))
+            rows = np.arange(start, stop, step)
+        flat = np.asarray(rows).reshape(-1)  # [N]
+        if flat.size and (flat.min() < 0 or flat.max() >= self.num_steps):
+            raise IndexError(f"rows run from 0 to {self.num_steps - 1}, got {flat.min()} to {flat.max()}.")
+        episode = self._episode_of(flat)
+        local = self._first[episode] + flat - self.start[episode]
+        out = np.empty((len(flat), *self.header.shapes[PIXELS]), np.uint8)
+        for number in np.unique(self._shard[episode]):
+            mine = self._shard[episode] == number
+            out[mine] = self.shards[number].frames(local[mine])
+        return out.reshape(*np.shape(rows), *out.shape[1:])
+
+    def _episode_of(self, rows: np.ndarray) -> np.ndarray:
+        """Position, from 0, of the episode that holds each row."""
+        return np.searchsorted(self.start, rows, side="right") - 1
+
+    def _open_data(self) -> None:
+        keys = [key for key in self.header.mapped if key != PIXELS]
+        self.arrays = {key: np.concatenate([self._rows_of(e)[key] for e in range(self.num_episodes)]) for key in keys}
+
+    def _rows_of(self, episode: int) -> dict[str, np.ndarray]:
+        span = slice(self._first[episode], self._first[episode] + self.length[episode])
+        return {key: rows[span] for key, rows in self.shards[self._shard[episode]].arrays.items() if key != PIXELS}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "arrays": None}
+
+
+def _index(shard: EpisodeStore) -> list:
+    """The index of a shard; its checksums are not among what a store keeps."""
+    return parse_index((shard.path / INDEX_FILE).read_bytes(), shard.path / INDEX_FILE)[0][: shard.num_episodes]

@@ -1,0 +1,113 @@
+"""A table on disk that grows row by row and survives kills and full disks."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from torchrl import torchrl_logger
+
+
+class CsvRows:
+    """Appends rows to a CSV file. A row may bring new columns: the file is then rewritten, in one piece, with them.
+
+    When the disk is full, or the file cannot be written for another reason, a warning is given once, what was written
+    of the row is taken back, and rows wait in memory until there is room again.
+
+    Args:
+        path: the file; made, with its folder, by the first row.
+        first: columns that come first, whether or not a row has them yet.
+
+    Examples:
+        >>> import tempfile
+        >>> rows = CsvRows(Path(tempfile.mkdtemp()) / "table.csv")
+        >>> rows.append({"step": 1, "loss": 0.5})
+        >>> rows.append({"step": 2, "rank": 3.0})
+        >>> rows.path.read_text().split()
+        ['step,loss,rank', '1,0.5,', '2,,3']
+    """
+
+    def __init__(self, path: Path, first: Iterable[str] = ()) -> None:
+        self.path, self._first = path, tuple(first)
+        self._columns: list[str] | None = None
+        self._waiting: list[dict[str, Any]] = []
+        self._warned = False
+
+    def append(self, row: dict[str, Any]) -> None:
+        """Writes a row, and those that waited for room."""
+        self._waiting.append(row)
+        try:
+            self._flush()
+        except OSError as error:
+            if not self._warned:
+                torchrl_logger.warning(f"{self.path} cannot be written ({error}): rows wait in memory until it can be.")
+            self._warned = True
+        else:
+            self._warned = False
+
+    def _flush(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        present, old = self._header(), []
+        columns = list(dict.fromkeys([*(present or self._first), *(key for row in self._waiting for key in row)]))
+        if columns != present:
+            if present:
+                with open(self.path, newline="") as file:
+                    old = [*csv.DictReader(file)]
+            self._replace(columns, [*old, *self._waiting])
+        else:
+            _append(self.path, _lines(columns, self._waiting))
+        self._columns, self._waiting = columns, []
+
+    def _header(self) -> list[str] | None:
+        """Columns of the file; None where there is no file, or none with a header."""
+        if self._columns is None and self.path.exists():
+            with open(self.path, newline="") as file:
+                self._columns = next(csv.reader(file), None)
+        return self._columns if self.path.exists() else None
+
+    def _replace(self, columns: list[str], rows: list[dict[str, Any]]) -> None:
+        part = self.path.with_suffix(".part")
+        try:
+            with open(part, "w", newline="") as file:
+                file.write(_lines(columns, [dict(zip(columns, columns)), *rows]))
+            os.replace(part, self.path)
+        finally:
+            part.unlink(missing_ok=True)
+
+    def drop_after(self, step: int) -> None:
+        """Removes whole rows of later steps, and torn ones of any, in one piece."""
+        self._columns, self._waiting = None, []
+        if not self.path.exists():
+            return
+        with open(self.path, newline="") as file:
+            header, *rows = [*csv.reader(file)] or [[]]  # a kill may leave an empty file
+        kept = [dict(zip(header, row)) for row in rows if len(row) == len(header) and int(row[0]) <= step]
+        if kept:
+            self._replace(header, kept)
+        else:
+            self.path.unlink()
+
+
+def _lines(columns: list[str], rows: list[dict[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="")
+    writer.writerows({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()} for row in rows)
+    return text.getvalue()
+
+
+def _append(path: Path, text: str) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND)
+    try:
+        before, data = os.fstat(descriptor).st_size, text.encode()
+        try:
+            while data:
+                data = data[os.write(descriptor, data) :]
+        except OSError:
+            os.ftruncate(descriptor, before)
+            raise
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,110 @@
+"""A job that is told to make room (SIGTERM) stops at the next step, in good order."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from types import FrameType
+
+from torchrl.trainers import Trainer
+
+from torchrl_ficreg.trainers.distributed import any_process, together
+
+# Told apart from success, from an error (1) and from a death by the signal (143): start the same command again. It is
+# the number that HTCondor takes for "wrote a checkpoint", and that a SLURM script can ask for before `scontrol requeue`.
+PREEMPTED = 85
+
+
+class Preempted(SystemExit):
+    """Ends the process with exit code :data:`PREEMPTED`; what it was doing continues when the command is repeated."""
+
+    def __init__(self, signum: int) -> None:
+        super().__init__(PREEMPTED)
+        self.signal = signal.Signals(signum)
+
+    def __str__(self) -> str:
+        return f"stopped by {self.signal.name}: the same command continues where it stopped."
+
+
+class _Handler:
+    """Installs itself for some signals, in the main thread, between ``__enter__`` and ``__exit__``."""
+
+    def __init__(self, signals: tuple[int, ...]) -> None:
+        self._signals, self._before = signals, {}
+
+    def __enter__(self) -> _Handler:
+        self._pid = os.getpid()
+        if threading.current_thread() is threading.main_thread():  # Python allows handlers nowhere else
+            self._before = {number: signal.signal(number, self._receive) for number in self._signals}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if os.getpid() != self._pid:  # a forked worker inherits the handler, but ends when it is told to
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        self._handle(number)
+
+    def _handle(self, number: int) -> None:
+        raise NotImplementedError
+
+
+class exit_on_signal(_Handler):  # noqa: N801 (reads as a statement, like contextlib's)
+    """Context: a signal raises :class:`Preempted` where the process happens to be, so that ``finally`` clauses run.
+
+    Examples:
+        >>> with exit_on_signal():
+        ...     os.kill(os.getpid(), signal.SIGTERM)
+        Traceback (most recent call last):
+        ...
+        torchrl_ficreg.trainers.signals.Preempted: stopped by SIGTERM: the same command continues where it stopped.
+    """
+
+    def __init__(self, *signals: int) -> None:
+        super().__init__(signals or (signal.SIGTERM,))
+
+    def _handle(self, number: int) -> None:
+        raise Preempted(number)
+
+
+class stop_on_signal(_Handler):  # noqa: N801
+    """Context around :meth:`OfflineTrainer.train`: a signal lets the step in progress finish and a checkpoint be written.
+
+    Where several processes train, all of them stop after the same step, whichever received the signal first.
+
+    Args:
+        trainer: to be stopped.
+        *signals: SIGTERM unless told otherwise.
+
+    Raises:
+        Preempted: on leaving, when a signal was received. Nothing is raised in its place where training failed.
+    """
+
+    def __init__(self, trainer: Trainer, *signals: int) -> None:
+        super().__init__(signals or (signal.SIGTERM,))
+        self._trainer, self._received = trainer, 0
+        self._alone = not together()
+        if not self._alone:
+            trainer.register_op("post_steps", self._agree)
+
+    def _handle(self, number: int) -> None:
+        self._received = number
+        if self._alone:
+            self._trainer.request_stop(signal.Signals(number).name)
+
+    def _agree(self) -> None:
+        device = next(self._trainer.loss_module.parameters()).device
+        if any_process(self._received != 0, device):
+            self._received = self._received or self._signals[0]
+            self._trainer.request_stop(signal.Signals(self._received).name)
+
+    def __exit__(self, kind: type[BaseException] | None, *details: object) -> None:
+        super().__exit__()
+        if kind is None and self._received:
+            raise Preempted(self._received)

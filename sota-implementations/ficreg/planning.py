@@ -91,7 +91,7 @@ def make_policy(
         folder = run_dir / POLICY_FOLDER if folder == "auto" else Path(folder)
         if not folder.exists():
             raise FileNotFoundError(f"no policy in {folder}: run train_policy.py checkpoint={run_dir} first.")
-        policy = load_goal_policy(folder, model)
+        policy = load_goal_policy(folder, model, device=model.action_mean.device)
     planner = SEARCHES[plan.search](
         model, plan_config(plan), action_bounds=bounds, cost=make_cost(plan, inverse_model), policy=policy
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -77,10 +77,13 @@ class LatentPlanner(MPCPlannerBase):
         if policy is not None:
             policy.check_fits(world_model)
         self.action_bounds = self._check_bounds(action_bounds)
-        self._wanted = wanted_by(self.cost)
         self._fast = FastDynamics()
-        mode = {"mode": "reduce-overhead"} if torch.cuda.is_available() else {}
-        self._rollout_cost = torch.compile(self._imagined_cost, **mode) if self.config.compile else self._imagined_cost
+        self._wanted = wanted_by(self.cost)
+        self._compiled: Callable[..., torch.Tensor] | None = None
+
+    def __getstate__(self) -> dict:
+        """Without the compiled rollout, which is bound to this very planner; a copy compiles its own."""
+        return {**self.__dict__, "_compiled": None}
 
     def _check_bounds(self, bounds) -> tuple[torch.Tensor, torch.Tensor] | None:
         if self.config.bounds == "none":
@@ -119,6 +122,9 @@ class LatentPlanner(MPCPlannerBase):
 
     def planning(self, td: TensorDictBase) -> torch.Tensor:
         """Writes ``plan`` and ``plan_cost`` into td and returns the first block [E, F * A]."""
+        missing = [key for key in (LATENT, GOAL_LATENT) if td.get(key, None) is None]
+        if missing:
+            raise KeyError(f"the planner reads {LATENT!r} and {GOAL_LATENT!r}; {', '.join(missing)} is missing.")
         result = self.plan(
             td.get(LATENT), td.get(GOAL_LATENT), td.get(PLAN_SEED, None), past_action=td.get(PAST_ACTION, None)
         )
@@ -160,7 +166,7 @@ class LatentPlanner(MPCPlannerBase):
             latent = latent.unsqueeze(1)  # [E, 1, D]
         if past_action is None and latent.ndim == 3 and latent.shape[1] == 1:
             past_action = latent.new_zeros(len(latent), 0, self.world_model.block_dim)
-        seeds = list(range(len(latent))) if seeds is None else seeds.flatten().tolist()
+        seeds = list(range(len(latent))) if seeds is None else torch.as_tensor(seeds).long().flatten().tolist()
         if initial is None:
             initial = latent.new_zeros(len(latent), self.config.horizon, self.world_model.block_dim)
         self._check_inputs(latent, goal, seeds, past_action, initial)
@@ -169,6 +175,7 @@ class LatentPlanner(MPCPlannerBase):
         group = self._group_size(latent)
         if latent.device.type == "cpu":
             keep_freed_memory()
+        self._wanted = wanted_by(self.cost)
         fast = uses_bf16(latent.device, self.config.precision)
         dynamics = self._fast.of(self.world_model) if fast else self.world_model
         with torch.inference_mode(not self.needs_gradient), torch.no_grad():
@@ -178,7 +185,10 @@ class LatentPlanner(MPCPlannerBase):
                 self._search(self._problem(dynamics, *(x[i : i + group] for x in (latent, past_action, goal, initial, seeds))))
                 for i in range(0, len(latent), group)
             ]
-        return torch.cat(results).clone()  # outside the inference mode, so that the user may write into it
+        result = torch.cat(results).clone()  # outside the inference mode, so that the user may write into it
+        if not (result[PLAN].isfinite().all() and result[PLAN_COST].isfinite().all()):
+            raise ValueError("planning gave numbers that are not finite: did the predictor diverge, or the cost?")
+        return result
 
     def _check_inputs(self, latent, goal, seeds, past_action, initial) -> None:
         model, horizon = self.world_model, self.config.horizon
@@ -187,6 +197,7 @@ class LatentPlanner(MPCPlannerBase):
         envs, width, block = len(latent), model.latent_dim, model.block_dim
         if (
             latent.ndim != 3
+            or envs < 1
             or latent.shape[-1] != width
             or goal.shape != (envs, width)
             or len(seeds) != envs
@@ -206,12 +217,16 @@ class LatentPlanner(MPCPlannerBase):
             if not value.isfinite().all():
                 raise ValueError(f"there are {name} that are not finite: did training diverge, or is a frame damaged?")
 
+    def _candidates(self) -> int:
+        """Most action sequences that are imagined at once for an environment."""
+        return self.config.num_candidates
+
     def _group_size(self, latent: torch.Tensor) -> int:
         """Environments planned for side by side."""
         if latent.device.type == "cpu":
-            return max(1, ROWS_AT_ONCE // self.config.num_candidates)
+            return max(1, ROWS_AT_ONCE // self._candidates())
         width = sum(layer.out_features for layer in self.world_model.predictor.modules() if isinstance(layer, nn.Linear))
-        rows = self.config.num_candidates * (self.config.horizon + latent.shape[1] - 1)
+        rows = self._candidates() * (self.config.horizon + latent.shape[1] - 1)
         return max(1, int(self.config.memory_budget * 2**30 / (4 * rows * max(1, width))))
 
     def _problem(self, dynamics, latent, past_action, goal, initial, seeds) -> Problem:
@@ -223,13 +238,21 @@ class LatentPlanner(MPCPlannerBase):
             initial if bounds is None else initial.clamp(*bounds),
             bounds,
             [make_generator(self.config.seed, seed, latent.device) for seed in seeds],
-            functools.partial(self._rollout_cost, dynamics),
+            functools.partial(self._rollout_cost(), dynamics),
         )
         if self.policy is not None and self.config.num_proposals:
             problem.proposals = self.policy.imagine(
                 self.world_model, latent, past_action, goal, self.config.horizon, bounds=bounds
             ).unsqueeze(1)  # [e, 1, horizon, F * A]
         return problem
+
+    def _rollout_cost(self) -> Callable[..., torch.Tensor]:
+        if not self.config.compile:
+            return self._imagined_cost
+        if self._compiled is None:
+            mode = {"mode": "reduce-overhead"} if torch.cuda.is_available() else {}
+            self._compiled = torch.compile(self._imagined_cost, **mode)
+        return self._compiled
 
     def _imagined_cost(self, dynamics, latent, past_action, goal, action) -> torch.Tensor:
         """Cost [e, K] of candidates [e, K, horizon, F * A]; the other shapes are those of a Problem."""
@@ -242,7 +265,13 @@ class LatentPlanner(MPCPlannerBase):
         predicted = dynamics.rollout(start, blocks).float()  # [e, K, horizon, D]
         extra = {"action": action, "start": latent[:, -1]}
         with autocast(latent.device, self.config.precision):
-            return self.cost(predicted, goal, **{name: extra[name] for name in self._wanted}).float()
+            cost = self.cost(predicted, goal, **{name: extra[name] for name in self._wanted})
+        if cost.shape != action.shape[:2]:
+            raise ValueError(
+                f"a cost maps predictions {list(predicted.shape)} and goals {list(goal.shape)} to [E, K] = "
+                f"{list(action.shape[:2])}, {type(self.cost).__name__} returned {list(cost.shape)}."
+            )
+        return cost.float()
 
     @abc.abstractmethod
     def _search(self, problem: Problem) -> TensorDict:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from torchrl_ficreg.modules.precision import Precision, uses_bf16
@@ -10,7 +10,10 @@ from torchrl_ficreg.modules.precision import Precision, uses_bf16
 
 @dataclass(frozen=True)
 class PlanConfig:
-    """Settings that all searches share. The defaults are the published evaluation of PushT (arXiv 2603.19312).
+    """Settings that all searches share, and all of CEM's.
+
+    The numbers are those of the published evaluation of PushT (arXiv 2603.19312); its ways with bounds and history are
+    ``bounds="none"`` and ``history="one_frame"``.
 
     Raises:
         ValueError: a number outside its range.
@@ -31,10 +34,15 @@ class PlanConfig:
     trace: bool = False  # also return cost and spread of every iteration
     precision: Precision = "auto"  # of the imagined rollouts: "auto", "fp32" or "bf16"
     compile: bool = False  # torch.compile the imagined rollouts; on CUDA with CUDA graphs
-    memory_budget: float = 4.0  # GiB that imagined rollouts may take; environments are planned in groups that fit
+    memory_budget: float = 4.0  # GiB of a GPU that imagined rollouts may take; environments are planned in groups that fit
     seed: int = 0  # of the random draws
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            kinds = {"int": int, "float": (int, float), "bool": bool}.get(field.type)
+            if kinds and (not isinstance(value, kinds) or isinstance(value, bool) != (kinds is bool)):
+                raise ValueError(f"{field.name} must be of type {field.type}, got {value!r}.")
         if not 2 <= self.num_elites <= self.num_candidates:
             raise ValueError(
                 f"num_elites must lie between 2 and num_candidates={self.num_candidates}, got {self.num_elites}."

@@ -122,7 +122,7 @@ class CostSum(nn.Module):
     With ``scale_free`` every term but the first is first scaled so that its standard deviation over the K candidates
     of an environment equals that of the first term. A weight of 0.5 then says "half as decisive as the first term"
     whatever units either has, in every environment and every iteration (arXiv 2607.02403). A plan on its own has no
-    spread: its cost is that of the first term.
+    spread: its cost is that of the first term alone, by its weight.
 
     Args:
         terms: costs; see the module.

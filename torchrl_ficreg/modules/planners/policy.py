@@ -30,6 +30,9 @@ class PolicyPlanner(LatentPlanner):
         if self.policy is None or not self.config.num_proposals:
             raise ValueError("PolicyPlanner needs a policy=, see train_policy.py, and num_proposals above 0.")
 
+    def _candidates(self) -> int:
+        return 1
+
     def _search(self, problem: Problem) -> TensorDict:
         plan = problem.proposals[:, 0]  # [e, horizon, F * A]
         return TensorDict({PLAN: plan, PLAN_COST: problem.cost(plan.unsqueeze(1))[:, 0]}, [len(plan)])

@@ -48,7 +48,7 @@ class SamplingPlanner(LatentPlanner):
         for iteration, noise in enumerate(draws.split(population, dim=1)):
             candidates = problem.clamp(mean.unsqueeze(1) + std.unsqueeze(1) * noise)  # [e, K, H, F * A]
             guests = elites if iteration == 0 else elites[:, : self._kept()]
-            candidates[:, 0] = mean
+            candidates[:, 0] = problem.clamp(mean)
             candidates[:, 1 : 1 + guests.shape[1]] = guests
             cost = problem.cost(candidates)  # [e, K]
             lowest, best = cost.topk(config.num_elites, dim=1, largest=False)  # [e, elites], ascending
@@ -66,7 +66,7 @@ class SamplingPlanner(LatentPlanner):
             trace.append(row)
             if config.stop_spread > 0 and done.all():
                 break
-        plan = self._choose(mean, elites)
+        plan = problem.clamp(self._choose(mean, elites))
         result = {PLAN: plan, PLAN_COST: problem.cost(plan.unsqueeze(1))[:, 0].clone()}
         if config.trace:
             result[TRACE] = _as_table(trace, config.iterations)

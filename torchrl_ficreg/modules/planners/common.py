@@ -83,7 +83,7 @@ class LatentPlanner(MPCPlannerBase):
 
     def __getstate__(self) -> dict:
         """Without the compiled rollout, which is bound to this very planner; a copy compiles its own."""
-        return {**self.__dict__, "_compiled": None}
+        return {**super().__getstate__(), "_compiled": None}
 
     def _check_bounds(self, bounds) -> tuple[torch.Tensor, torch.Tensor] | None:
         if self.config.bounds == "none":

@@ -27,6 +27,7 @@ OPTIMAL = {
 FAST = {"num_candidates": 24, "num_elites": 5, "iterations": 4, "num_proposals": 4}
 FAST |= {"horizon": 3, "receding_horizon": 1, "precision": "fp32"}
 STOP = 0.7  # where some of the tiny world's searches stop early and others do not
+UNSTOPPED = ("gradient", "shooting")  # which refuse to
 
 
 def make(search, world, *, cost=None, policy=None, **settings):
@@ -141,7 +142,7 @@ def test_random_shooting_is_better_than_doing_nothing_and_worse_than_the_optimum
 def test_a_plan_is_the_same_alone_among_seven_and_in_any_order(tiny_world, policy, search, proposals, stop_spread):
     """To the last bit, however long the others search."""
     proposes = policy if proposals or search == "policy" else None
-    planner = make(search, tiny_world(), policy=proposes, stop_spread=stop_spread)
+    planner = make(search, tiny_world(), policy=proposes, stop_spread=stop_spread * (search not in UNSTOPPED))
     latent, goal, seeds = torch.randn(7, 6), torch.randn(7, 6), torch.tensor([3, 1, 4, 15, 92, 65, 35])
     together, order = planner.plan(latent, goal, seeds), torch.randperm(7)
     shuffled = planner.plan(latent[order], goal[order], seeds[order])
@@ -155,6 +156,7 @@ def test_a_plan_is_the_same_alone_among_seven_and_in_any_order(tiny_world, polic
 @pytest.mark.parametrize("search", SEARCHES)
 def test_side_by_side_the_plans_are_those_of_one_by_one(tiny_world, policy, monkeypatch, search, stop_spread):
     """As where there is a GPU: a group is one batch, in which some stop before others."""
+    stop_spread *= search not in UNSTOPPED
     planner = make(search, tiny_world(), policy=policy, stop_spread=stop_spread, trace=True, iterations=6)
     generator = torch.Generator().manual_seed(0)
     latent, goal = torch.randn(2, 7, 6, generator=generator)
@@ -166,7 +168,7 @@ def test_side_by_side_the_plans_are_those_of_one_by_one(tiny_world, policy, monk
     if search != "policy":
         for key, value in single["trace"].items():
             torch.testing.assert_close(grouped["trace", key], value, rtol=1e-2, atol=1e-3, equal_nan=True)
-    if stop_spread and search not in ("gradient", "policy"):
+    if stop_spread and search != "policy":
         assert len(single["trace", "spread"].isnan().sum(1).unique()) > 1, "they all stopped together"
 
 
@@ -265,3 +267,9 @@ def test_compiled_it_plans_the_same(tiny_world):
     plain, compiled = (make("cem", tiny_world(), iterations=2, compile=on).plan(latent, goal) for on in (False, True))
     torch.testing.assert_close(compiled["plan"], plain["plan"], rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(compiled["plan_cost"], plain["plan_cost"], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("search", UNSTOPPED)
+def test_a_search_that_nothing_could_stop_says_so(tiny_world, search):
+    with pytest.raises(ValueError, match="leave stop_spread at 0"):
+        make(search, tiny_world(), stop_spread=0.1)

@@ -15,6 +15,7 @@ from torchrl.modules.planners import MPCPlannerBase
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.goal_policy import GoalPolicy
 from torchrl_ficreg.modules.memory import keep_freed_memory
+from torchrl_ficreg.modules.planners.bounds import block_bounds, check_bounds
 from torchrl_ficreg.modules.planners.config import PlanConfig
 from torchrl_ficreg.modules.planners.costs import Cost, GoalDistance, wanted_by
 from torchrl_ficreg.modules.planners.dynamics import FastDynamics
@@ -92,28 +93,11 @@ class LatentPlanner(MPCPlannerBase):
             raise ValueError(
                 "the planner needs action_bounds=(low, high) in environment units, or PlanConfig(bounds='none')."
             )
-        low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in bounds)
-        shape = self.world_model.action_mean.shape
-        if low.shape != shape or high.shape != shape or not (low < high).all():
-            raise ValueError(
-                f"action_bounds must be low < high of shape {list(shape)}, got {low.tolist()} and {high.tolist()}: "
-                "was the model trained for another environment?"
-            )
-        mean, std = self.world_model.action_mean.cpu(), self.world_model.action_std.cpu()
-        # No distribution inside the bounds has a mean outside them or a std above half their distance.
-        if ((mean < low) | (mean > high) | (std > (high - low) / 2 * 1.001)).any() and (std != 1).any():
-            raise ValueError(
-                f"the model's action statistics (mean {mean.tolist()}, std {std.tolist()}) cannot come from actions "
-                f"between {low.tolist()} and {high.tolist()}: was the model trained for another environment?"
-            )
-        return low, high
+        return check_bounds(self.world_model, bounds)
 
     def block_bounds(self) -> tuple[torch.Tensor, torch.Tensor] | None:
         """Bounds of a z-scored action block, (low [F * A], high [F * A]), or None."""
-        if self.action_bounds is None:
-            return None
-        statistics, repeat = self.world_model.statistics, self.world_model.frame_skip
-        return tuple(statistics.normalize(bound.to(statistics.mean.device)).repeat(repeat) for bound in self.action_bounds)
+        return None if self.action_bounds is None else block_bounds(self.world_model, self.action_bounds)
 
     @property
     def context(self) -> int:

@@ -127,3 +127,5 @@ class GradientConfig(PlanConfig):
         super().__post_init__()
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate must be positive, got {self.learning_rate}.")
+        if self.stop_spread > 0:
+            raise ValueError("gradient descent has no elites whose spread could stop it: leave stop_spread at 0.")

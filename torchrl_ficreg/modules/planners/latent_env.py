@@ -11,6 +11,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
+from torchrl_ficreg.modules.planners.bounds import block_bounds, check_bounds
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 PAST_LATENT, PAST_ACTION, PAST_LENGTH = "past_latent", "past_action", "past_length"
@@ -114,7 +115,7 @@ class LatentGoalEnv(ModelBasedEnvBase):
         if action_bounds is None:
             self.action_spec = Unbounded((network.action_dim,), **kind)
         else:
-            self.action_spec = Bounded(*_block_bounds(world_model, action_bounds), **kind)
+            self.action_spec = Bounded(*block_bounds(world_model, check_bounds(world_model, action_bounds)), **kind)
         self.reward_spec = Unbounded((1,), **kind)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
@@ -186,18 +187,3 @@ class LatentGoalEnv(ModelBasedEnvBase):
 def _squared_distance(latent: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
     """[..., D] and [..., D] -> [..., 1]."""
     return (latent - goal).square().sum(-1, keepdim=True)
-
-
-def _block_bounds(
-    world_model: LatentWorldModel, bounds: tuple[Sequence[float], Sequence[float]]
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Raw bounds (low [A], high [A]) -> those of a z-scored action block, (low [F * A], high [F * A])."""
-    mean = world_model.action_mean
-    low, high = (torch.as_tensor(bound, dtype=mean.dtype, device=mean.device) for bound in bounds)
-    if low.shape != mean.shape or high.shape != mean.shape or not (low < high).all():
-        raise ValueError(
-            f"action_bounds must be low < high of shape {list(mean.shape)} in environment units, got {low.tolist()} "
-            f"and {high.tolist()}: was the model trained for another environment?"
-        )
-    statistics = world_model.statistics
-    return tuple(statistics.normalize(bound).repeat(world_model.frame_skip) for bound in (low, high))

@@ -10,6 +10,8 @@ from torchrl_ficreg.modules.planners.sampling import SamplingPlanner
 class RandomShooting(SamplingPlanner):
     """The best of ``iterations x num_candidates`` random action sequences: what any search has to beat.
 
+    In every iteration one of them is standing still and one the best so far.
+
     See :class:`~torchrl_ficreg.LatentPlanner` for what is read and written.
 
     Examples:
@@ -20,6 +22,11 @@ class RandomShooting(SamplingPlanner):
         >>> planner.plan(torch.zeros(3, 4), torch.ones(3, 4))["plan"].shape
         torch.Size([3, 5, 10])
     """
+
+    def __init__(self, *args, **kwargs) -> None:
+        super().__init__(*args, **kwargs)
+        if self.config.stop_spread > 0:
+            raise ValueError("random shooting fits nothing that could settle: leave stop_spread at 0.")
 
     def _kept(self) -> int:
         return 1

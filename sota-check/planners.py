@@ -26,8 +26,8 @@ SEARCHES = {
     "shooting 300 x 10": ["plan=shooting"],
     "policy": ["plan=policy"],
     "iCEM 100 x 5 + policy": ["plan=icem", "plan.iterations=5", "plan.policy=auto"],
-    "CEM 300 x 10 + judge": ["plan=cem", "plan.consistency=0.1"],
-    "CEM 300 x 10, replanned": ["plan=cem", "plan.receding_horizon=1"],
+    "judged CEM 300 x 10": ["plan=cem", "plan.consistency=0.1"],
+    "replanned CEM 300 x 10": ["plan=cem", "plan.receding_horizon=1"],
 }
 
 

@@ -92,7 +92,7 @@ def draw(tables: dict, target: Path) -> None:
         for name, row in table.items():
             low, high = row["success_interval"]
             rate = row["success_rate"]
-            axis.errorbar(row["seconds"], rate, [[rate - low], [high - rate]], fmt="o", capsize=2, lw=0.8)
+            axis.errorbar(row["seconds"], rate, [[max(0.0, rate - low)], [max(0.0, high - rate)]], fmt="o", capsize=2, lw=0.8)
             axis.annotate(name, (row["seconds"], rate), xytext=(6, 4), textcoords="offset points", fontsize=7)
         axis.axhline(next(iter(table.values()))["random"], color="grey", ls=":", lw=1)
         axis.set(title=run, xscale="log", xlabel="seconds of planning in an episode", ylabel="success", ylim=(0, 1.05))

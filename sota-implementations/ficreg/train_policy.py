@@ -24,8 +24,9 @@ from utils import encoder_of, flatten, get_device, versions, write_json
 from torchrl_ficreg import LatentWorldModel
 from torchrl_ficreg.data.latents import BLOCKS, encode_episodes, GoalRows
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
-from torchrl_ficreg.modules.goal_policy import GoalPolicy, load_goal_policy, require_safetensors, save_goal_policy
+from torchrl_ficreg.modules.goal_policy import GoalPolicy, load_goal_policy, save_goal_policy
 from torchrl_ficreg.modules.precision import autocast, uses_bf16
+from torchrl_ficreg.modules.safe_files import require_safetensors
 from torchrl_ficreg.trainers import find_checkpoint, load_world_model, ModelCard, WarmupCosine
 
 METRICS = "metrics.json"

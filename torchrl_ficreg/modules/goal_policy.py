@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -14,6 +13,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.goal_network import GoalNetwork
+from torchrl_ficreg.modules.safe_files import require_safetensors
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 FORMAT, VERSION = "torchrl_ficreg.goal_policy", 1
@@ -244,19 +244,6 @@ def load_goal_policy(
             "this model with train_policy.py, overwrite=true."
         )
     return policy.to(device).eval()
-
-
-def require_safetensors() -> ModuleType:
-    """The package by which policies are saved, looked for before there is something to lose.
-
-    Raises:
-        ImportError: it is not installed.
-    """
-    try:
-        import safetensors.torch
-    except ImportError as error:
-        raise ImportError("safetensors is missing: pip install 'torchrl_ficreg[pretrained]'.") from error
-    return safetensors
 
 
 def _read_config(file: Path) -> dict[str, Any]:

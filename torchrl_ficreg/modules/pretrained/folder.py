@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -19,6 +18,7 @@ from torchrl_ficreg.modules.pretrained.sizes import (
     Sizes,
     world_model_sizes,
 )
+from torchrl_ficreg.modules.safe_files import require_safetensors
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 FORMAT, VERSION = "torchrl_ficreg.world_model", 1
@@ -65,7 +65,7 @@ def save_pretrained(
         >>> read == card, torch.equal(same.predictor.module.position, model.predictor.module.position)
         (True, True)
     """
-    safetensors = _safetensors()
+    safetensors = require_safetensors()
     card, sizes = dict(card or {}), world_model_sizes(model)
     _check_card(card, model, sizes)
     parts: dict[str, nn.Module] = {_MODEL: model} | ({} if inverse_model is None else {_INVERSE: inverse_model})
@@ -111,7 +111,7 @@ def load_pretrained(
         FileNotFoundError: no such files.
         ValueError: another format or version, damaged files, or files that do not belong together.
     """
-    safetensors = _safetensors()
+    safetensors = require_safetensors()
     folder = Path(folder).expanduser()
     for name in (CONFIG_FILE, WEIGHTS_FILE):
         if not (folder / name).is_file():
@@ -134,14 +134,6 @@ def load_pretrained(
     for part in parts.values():
         part.to(device).eval()
     return model, inverse_model, card
-
-
-def _safetensors() -> ModuleType:
-    try:
-        import safetensors.torch
-    except ImportError as error:
-        raise ImportError("safetensors is missing: pip install 'torchrl_ficreg[pretrained]'.") from error
-    return safetensors
 
 
 def _statistics(model: LatentWorldModel) -> dict[str, list[float]]:

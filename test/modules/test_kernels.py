@@ -53,20 +53,22 @@ def under_autocast(layer, x):
 
 
 @pytest.mark.parametrize("lead", [(2048,), (4, 512), (3,)])
+@pytest.mark.parametrize("width, out", [(24, 16), (16, 24), (16, 16)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_a_linear_layer_is_that_of_torch_to_bfloat16(lead, dtype):
+def test_a_linear_layer_is_that_of_torch_to_bfloat16(lead, width, out, dtype):
     """Values, and gradients in the dtypes of what they belong to, of many rows and of few."""
-    ours, x = Linear(24, 16), torch.randn(*lead, 24, dtype=dtype, requires_grad=True)
-    theirs = torch.nn.Linear(24, 16)
+    ours, x = Linear(width, out), torch.randn(*lead, width, dtype=dtype, requires_grad=True)
+    theirs = torch.nn.Linear(width, out)
     theirs.load_state_dict(ours.state_dict())
     for mine, other in zip(under_autocast(ours, x), under_autocast(theirs, x)):
         assert mine.dtype == other.dtype
         torch.testing.assert_close(mine, other, rtol=1e-2, atol=1e-2 * other.abs().max().item())
 
 
-def test_the_gradient_of_a_bias_is_summed_in_float32():
+@pytest.mark.parametrize("width, out", [(2, 3), (3, 2)])
+def test_the_gradient_of_a_bias_is_summed_in_float32(width, out):
     """A sum kept in bfloat16 would stop growing at 256."""
-    layer, x = Linear(2, 3), torch.zeros(5000, 2)
+    layer, x = Linear(width, out), torch.zeros(5000, width)
     with torch.autocast("cpu", torch.bfloat16):
         layer(x).sum().backward()
     assert (layer.bias.grad - 5000).abs().max() <= 8  # half of what one bit of bfloat16 is worth there

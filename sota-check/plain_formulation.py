@@ -19,6 +19,7 @@ from torchrl_ficreg.objectives.sigreg import standard_normal
 
 Mix = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, bool], torch.Tensor]
 
+
 def plain_terms(loss: FICRegLoss, clip: TensorDictBase, mix: Mix) -> dict[str, torch.Tensor]:
     """The four weighted terms.
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from unittest.mock import patch
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
+from torchrl_ficreg.modules import kernels, transformer
 from torchrl_ficreg.trainers import OfflineTrainer
 
 
@@ -25,9 +29,28 @@ def take_step(trainer: OfflineTrainer, clip: TensorDictBase) -> None:
 
 def operations_of_step(trainer: OfflineTrainer, clip: TensorDictBase) -> int:
     """Additions and multiplications of all matrix products of one step, forward and backward."""
-    with _Counter() as counter:
+    with without_cpu_kernels(), _Counter() as counter:
         take_step(trainer, clip)
     return counter.operations
+
+
+@contextmanager
+def without_cpu_kernels(*, fused: bool = False) -> Iterator[None]:
+    """Layers as a GPU runs them: what the package does to save time on CPUs would be counted as work.
+
+    Args:
+        fused: attention by torch's fused kernel, whose products cannot be counted, and which keeps no weights.
+    """
+
+    def attend(query, key, value, causal, dropout=0.0):
+        return F.scaled_dot_product_attention(query, key, value, is_causal=causal, dropout_p=dropout)
+
+    with (
+        patch.object(kernels, "trains_on_cpu", lambda x: False),
+        patch.object(transformer, "trains_on_cpu", lambda x: False),
+        patch.object(transformer, "attend", attend if fused else transformer.attend),
+    ):
+        yield
 
 
 class _Counter(TorchDispatchMode):

@@ -46,7 +46,7 @@ def main() -> None:
     """Measures, prints and writes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--clips", type=int, default=8)
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--quick", action="store_true", help="two clips and one repeat, to see it run")
     parser.add_argument("--profile", action="store_true", help="only print where the time of our step goes")
     parser.add_argument("--out", type=Path, default=RESULT)

@@ -104,7 +104,7 @@ def against_stock_planner(preset: str, envs: int, candidates: int, iterations: i
     )
 
     def plan_stock(latent: torch.Tensor, goal: torch.Tensor) -> None:
-        keep_freed_memory(32 * 2**20)  # what glibc comes to by itself
+        keep_freed_memory(32 * 2**20, lower=True)  # what glibc comes to by itself
         with torch.no_grad():
             stock(stock.env.reset(TensorDict({"latent": latent, "goal_latent": goal}, [len(latent)])))
 
@@ -137,7 +137,7 @@ def in_turns(ways: dict[str, Way], envs: int, latent_dim: int, repeats: int) -> 
 @torch.no_grad()
 def plain_cem(model: LatentWorldModel, latent: torch.Tensor, goal: torch.Tensor, iterations: int, precision: str) -> None:
     """CEM, environment by environment, 300 candidates, 30 elites."""
-    keep_freed_memory(32 * 2**20)  # what glibc comes to by itself
+    keep_freed_memory(32 * 2**20, lower=True)  # what glibc comes to by itself
     for start, target in zip(latent, goal):
         mean, std = torch.zeros(HORIZON, model.block_dim), torch.ones(HORIZON, model.block_dim)
         for _ in range(iterations):

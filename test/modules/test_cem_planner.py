@@ -140,6 +140,8 @@ def test_it_is_a_torchrl_planner_and_a_tensordict_module(linear_world):
     assert set(td.keys()) == {"latent", "goal_latent", "other", "plan_seed", "plan", "plan_cost", "action"}
     assert td["plan"].equal(expected["plan"])
     assert td["action"].equal(expected["plan"][:, 0])
+    assert set(planner.out_keys) == {"action", "plan", "plan_cost"}
+    assert len(planner.state_dict()) == len(planner.world_model.state_dict())  # the model once
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from torchrl_ficreg import LatentCEMPlanner, LatentPlanner, MPCPolicy, PlanConfig
+from torchrl_ficreg import LatentCEMPlanner, LatentPlanner, make_world_model, ModelConfig, MPCPolicy, PlanConfig
 from torchrl_ficreg.envs import make_env
 
 SIZES = {"num_candidates": 8, "num_elites": 2, "iterations": 2, "horizon": 3, "precision": "fp32"}
@@ -78,6 +78,20 @@ def test_a_reset_environment_is_planned_for_alone(linear_world):
     assert td["mpc", "cursor"].tolist() == [3, 1, 3]
     torch.testing.assert_close(td["action"][:, 0], torch.tensor([1.004, 50.0, 3.004]))
     torch.testing.assert_close(td["mpc", "plan_cost"], torch.tensor([1.0, 50.0, 3.0]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_a_policy_cast_as_a_whole_plans_in_its_dtype(dtype):
+    """Queue and plan follow the model's dtype, through several plans; the cost stays a float32."""
+    model, _ = make_world_model(ModelConfig.preset("cpu", latent_dim=4, history=2), action_dim=2)
+    config = PlanConfig(num_candidates=4, num_elites=2, iterations=1, horizon=2, receding_horizon=1)
+    policy = MPCPolicy(LatentCEMPlanner(model.eval(), config, action_bounds=([-1, -1], [1, 1]))).to(dtype)
+    frame = torch.zeros(2, 3, 64, 64, dtype=torch.uint8)
+    td = TensorDict({"pixels": frame, "goal_pixels": frame}, [2])
+    for _ in range(6):
+        td = policy(td)
+    assert td["action"].dtype == td["mpc", "plan"].dtype == dtype and td["action"].abs().max() <= 1
+    assert td["mpc", "plan_cost"].dtype == torch.float32 and td["mpc", "count"].tolist() == [2, 2]
 
 
 def test_its_memory_is_in_the_tensordict_alone(linear_world):

@@ -66,8 +66,7 @@ class LatentPlanner(MPCPlannerBase):
         policy: GoalPolicy | None = None,
     ) -> None:
         # MPCPlannerBase.__init__ wants an environment to imagine in; the world model takes its place.
-        SafeModule.__init__(self, world_model, in_keys=[LATENT, GOAL_LATENT], out_keys=[ACTION])
-        self.world_model = world_model
+        SafeModule.__init__(self, world_model, in_keys=[LATENT, GOAL_LATENT], out_keys=[ACTION, PLAN, PLAN_COST])
         self.config = self.config_class() if config is None else config
         if not isinstance(self.config, self.config_class):
             raise TypeError(
@@ -85,6 +84,11 @@ class LatentPlanner(MPCPlannerBase):
     def __getstate__(self) -> dict:
         """Without the compiled rollout, which is bound to this very planner; a copy compiles its own."""
         return {**super().__getstate__(), "_compiled": None}
+
+    @property
+    def world_model(self) -> LatentWorldModel:
+        """The dynamics."""
+        return self.module
 
     def _check_bounds(self, bounds) -> tuple[torch.Tensor, torch.Tensor] | None:
         if self.config.bounds == "none":
@@ -105,20 +109,24 @@ class LatentPlanner(MPCPlannerBase):
         return 1 if self.config.history == "one_frame" else self.world_model.history
 
     def planning(self, td: TensorDictBase) -> torch.Tensor:
-        """Writes ``plan`` and ``plan_cost`` into td and returns the first block [E, F * A]."""
-        missing = [key for key in (LATENT, GOAL_LATENT) if td.get(key, None) is None]
-        if missing:
-            raise KeyError(f"the planner reads {LATENT!r} and {GOAL_LATENT!r}; {', '.join(missing)} is missing.")
-        result = self.plan(
-            td.get(LATENT), td.get(GOAL_LATENT), td.get(PLAN_SEED, None), past_action=td.get(PAST_ACTION, None)
-        )
-        td.update(result)
-        return result[PLAN][:, 0]
+        """The first block [E, F * A] of the plan for what td holds, which is left as it is."""
+        return self._plan_from(td)[PLAN][:, 0]
 
     def forward(self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None) -> TensorDictBase:
         """See the class."""
-        action = self.planning(tensordict)
-        return self._write_to_tensordict(tensordict, (action,), tensordict_out)
+        result = self._plan_from(tensordict)
+        written = (result[PLAN][:, 0], result[PLAN], result[PLAN_COST])
+        tensordict_out = self._write_to_tensordict(tensordict, written, tensordict_out)
+        return tensordict_out.update(result.exclude(PLAN, PLAN_COST))
+
+    def _plan_from(self, td: TensorDictBase) -> TensorDict:
+        """What :meth:`plan` returns for what td holds."""
+        missing = [key for key in (LATENT, GOAL_LATENT) if td.get(key, None) is None]
+        if missing:
+            raise KeyError(f"the planner reads {LATENT!r} and {GOAL_LATENT!r}; {', '.join(missing)} is missing.")
+        return self.plan(
+            td.get(LATENT), td.get(GOAL_LATENT), td.get(PLAN_SEED, None), past_action=td.get(PAST_ACTION, None)
+        )
 
     def plan(
         self,

@@ -82,7 +82,7 @@ class MPCPolicy(TensorDictModuleBase):
                     "cursor": zeros + actions,
                     "count": zeros,
                     PLAN: like.new_zeros(envs, config.horizon, model.block_dim),
-                    PLAN_COST: like.new_zeros(envs),
+                    PLAN_COST: like.new_zeros(envs, dtype=torch.float32),  # as planners give it
                     "past_latent": like.new_zeros(envs, past, model.latent_dim),
                     PAST_ACTION: like.new_zeros(envs, past, model.block_dim),
                     "past_count": zeros.clone(),
@@ -139,13 +139,14 @@ class MPCPolicy(TensorDictModuleBase):
                 past_action=memory[PAST_ACTION][rows, first:],
                 initial=initial[rows],
             )
-            result[rows] = found.select(PLAN, PLAN_COST)
+            result[PLAN][rows] = found[PLAN].to(initial.dtype)
+            result[PLAN_COST][rows] = found[PLAN_COST]
         blocks = result[PLAN][:, : config.receding_horizon]  # [e, R, F * A]
         queue = blocks.unflatten(-1, (model.frame_skip, -1)).flatten(1, 2)  # [e, R * F, A]
         queue = model.statistics.denormalize(queue)
         if self.planner.action_bounds is not None:  # undo the rounding of z-scoring forth and back
             queue = queue.clamp(*(bound.to(device) for bound in self.planner.action_bounds))
-        count = memory["count"] + 1
+        count, queue = memory["count"] + 1, queue.to(memory["queue"].dtype)
         return memory.update({**result, "queue": queue, "cursor": torch.zeros_like(count), "count": count})
 
     def _rest_of_last_plan(self, memory: TensorDict) -> torch.Tensor:

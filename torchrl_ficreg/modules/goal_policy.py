@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -13,7 +12,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.goal_network import GoalNetwork
-from torchrl_ficreg.modules.safe_files import require_safetensors
+from torchrl_ficreg.modules.safe_files import read_config, require_safetensors
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 FORMAT, VERSION = "torchrl_ficreg.goal_policy", 1
@@ -224,7 +223,9 @@ def load_goal_policy(
     for name in (CONFIG_FILE, WEIGHTS_FILE):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"no {name} in {folder}: train a policy with train_policy.py checkpoint=...")
-    content = _read_config(folder / CONFIG_FILE)
+    content = read_config(
+        folder / CONFIG_FILE, FORMAT, VERSION, instead="give a folder that save_goal_policy wrote."
+    )
     try:
         tensors = safetensors.torch.load_file(folder / WEIGHTS_FILE)
     except safetensors.SafetensorError as error:
@@ -244,20 +245,6 @@ def load_goal_policy(
             "this model with train_policy.py, overwrite=true."
         )
     return policy.to(device).eval()
-
-
-def _read_config(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file} is not JSON ({error}): train the policy again.") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"{file} is not of the format {FORMAT!r}: give a folder that save_goal_policy wrote.")
-    if content.get("version") != VERSION:
-        raise ValueError(
-            f"{file} has version {content.get('version')!r}, this release reads {VERSION}: update torchrl_ficreg."
-        )
-    return content
 
 
 def _checksum(world_model: LatentWorldModel) -> str:

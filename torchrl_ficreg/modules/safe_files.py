@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 
 def require_safetensors() -> ModuleType:
@@ -16,3 +19,27 @@ def require_safetensors() -> ModuleType:
     except ImportError as error:
         raise ImportError("safetensors is missing: pip install 'torchrl_ficreg[pretrained]'.") from error
     return safetensors
+
+
+def read_config(file: Path, kind: str, version: int, *, instead: str) -> dict[str, Any]:
+    """The content of one of our JSON files.
+
+    Args:
+        file: to be read.
+        kind, version: what its fields ``format`` and ``version`` must say.
+        instead: what to do about a file of another format.
+
+    Raises:
+        ValueError: it is not JSON, or of another format or version.
+    """
+    try:
+        content = json.loads(file.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{file} is not JSON ({error}): is it damaged?") from error
+    if not isinstance(content, dict) or content.get("format") != kind:
+        raise ValueError(f"{file} is not of the format {kind!r}: {instead}")
+    if content.get("version") != version:
+        raise ValueError(
+            f"{file} has version {content.get('version')!r}, this release reads {version}: update torchrl_ficreg."
+        )
+    return content

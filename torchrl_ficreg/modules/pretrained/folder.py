@@ -18,7 +18,7 @@ from torchrl_ficreg.modules.pretrained.sizes import (
     Sizes,
     world_model_sizes,
 )
-from torchrl_ficreg.modules.safe_files import require_safetensors
+from torchrl_ficreg.modules.safe_files import read_config, require_safetensors
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 FORMAT, VERSION = "torchrl_ficreg.world_model", 1
@@ -116,7 +116,9 @@ def load_pretrained(
     for name in (CONFIG_FILE, WEIGHTS_FILE):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"no {name} in {folder}: give a folder that save_pretrained wrote.")
-    content = _read_config(folder / CONFIG_FILE)
+    content = read_config(
+        folder / CONFIG_FILE, FORMAT, VERSION, instead="an official LeWM checkpoint is read by load_lewm."
+    )
     try:
         tensors = safetensors.torch.load_file(folder / WEIGHTS_FILE)
     except safetensors.SafetensorError as error:
@@ -155,20 +157,6 @@ def _check_card(card: dict[str, Any], model: LatentWorldModel, sizes: Sizes) -> 
     other = [f"{name} {named[name]}, not {value}" for name, value in ours.items() if named.get(name, value) != value]
     if other:
         raise ValueError(f"card['model'] describes another model: {', '.join(other)}.")
-
-
-def _read_config(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file} is not JSON ({error}).") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"{file} is not of the format {FORMAT!r}: an official LeWM checkpoint is read by load_lewm.")
-    if content.get("version") != VERSION:
-        raise ValueError(
-            f"{file} has version {content.get('version')!r}, this release reads {VERSION}: update torchrl_ficreg."
-        )
-    return content
 
 
 def _fill(parts: dict[str, nn.Module], tensors: dict[str, torch.Tensor], folder: Path) -> None:

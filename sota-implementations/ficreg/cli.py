@@ -61,8 +61,11 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
         start = hydra.main(config_path=str(CONFIG_DIR), config_name=config_name, version_base="1.3")(run)
 
         def checked() -> None:
+            arguments = get_args_parser().parse_args()
+            if arguments.multirun:
+                _let_jobs_import_us()
             try:
-                check_overrides(config_name, get_args_parser().parse_args().overrides)
+                check_overrides(config_name, arguments.overrides)
             except (ValueError, HydraException, OmegaConfBaseException) as error:
                 sys.exit(f"error: {_one_line(error)}")
             try:
@@ -73,6 +76,12 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
         return checked
 
     return decorate
+
+
+def _let_jobs_import_us() -> None:
+    """A job of a sweep is unpickled in a process that was not started with this folder's scripts."""
+    inherited = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(CONFIG_DIR.parent), *([inherited] if inherited else [])])
 
 
 def check_overrides(config_name: str, arguments: list[str]) -> None:

@@ -87,11 +87,22 @@ def test_launchers_are_known_and_name_what_they_need(launcher, plugin):
         assert plugin in cfg.hydra.launcher._target_
 
 
-def test_a_sweep_over_seeds_makes_a_run_of_each(command, environment, tmp_path):
-    line = command("train.py", "seed=0,1", "evaluation.num_pairs=2", "evaluation.record=1", "-m")
+@pytest.mark.parametrize(
+    ("launcher", "plugin"),
+    [
+        ("basic", "hydra"),
+        pytest.param("processes", "hydra_plugins.hydra_joblib_launcher", marks=pytest.mark.slow),
+        pytest.param("submitit_local", "hydra_plugins.hydra_submitit_launcher", marks=pytest.mark.slow),
+    ],
+)
+def test_a_sweep_over_seeds_makes_a_run_of_each(command, environment, tmp_path, launcher, plugin):
+    """One after another, side by side, and pickled as SLURM's launcher pickles them."""
+    pytest.importorskip(plugin)
+    small = ("evaluation.num_pairs=2", "evaluation.record=1")
+    line = command("train.py", "seed=0,1", *small, f"hydra/launcher={launcher}", "-m")
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    folders = sorted(path.name for path in (tmp_path / "runs").iterdir() if path.is_dir())
+    folders = sorted(path.name for path in (tmp_path / "runs").iterdir() if path.is_dir() and path.name[0] != ".")
     assert folders == ["two_room_cpu_ficreg_seed0", "two_room_cpu_ficreg_seed1"]
     results = [json.loads((tmp_path / "runs" / name / "results.json").read_text()) for name in folders]
     assert results[0]["ficreg"]["pairs_hash"] == results[1]["ficreg"]["pairs_hash"]

@@ -148,4 +148,7 @@ def test_lewm_trains_and_other_loggers_work(trained, execute, tmp_path, backend)
     assert "lewm" in json.loads((run_dir / "results.json").read_text())
     pattern = "events.out.*" if backend == "tensorboard" else "run-*.wandb"
     assert list((run_dir / backend).rglob(pattern))
+    if backend == "wandb":
+        media = {path.name for path in (run_dir / "wandb").rglob("files/media/*") if any(path.rglob("*.*"))}
+        assert media == {"table", "images", "videos"}
     assert {path.name for path in tmp_path.iterdir()} == {"data", "runs"}

@@ -166,7 +166,7 @@ renderer.draw(data, 0)
     assert "Exception ignored" not in result.stderr
 
 
-@pytest.mark.parametrize("backend", ["glfw", "osmesa", "off", "nonsense"])
+@pytest.mark.parametrize("backend", ["osmesa", "nonsense", *(pytest.param(name, marks=pytest.mark.slow) for name in ("glfw", "off"))])
 def test_a_backend_that_cannot_draw_here_is_named(backend, tmp_path):
     code = "model, data = scene(); gl.OffscreenRenderer(model, size=16).draw(data, 0)"
     result = python(code, tmp_path, lacks="OSMesa", MUJOCO_GL=backend, PYTHONWARNINGS="ignore")
@@ -175,7 +175,7 @@ def test_a_backend_that_cannot_draw_here_is_named(backend, tmp_path):
     assert "Exception ignored" not in result.stderr
 
 
-@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+@pytest.mark.parametrize("backend", ["egl", pytest.param("osmesa", marks=pytest.mark.slow)])
 def test_nothing_is_said_at_exit(backend, tmp_path):
     """Renderers open, closed, dropped and in a cycle at exit; a worker that is ended, and one that is killed."""
     code = """

@@ -10,7 +10,15 @@ import pytest
 from torchrl_ficreg.envs.gl import gl_works
 
 ACTION_DIM = {"push_t": 2, "reacher": 2, "cube": 5}
-SHORT = ["env.data.max_steps=30", "env.budget=26", "evaluation.num_pairs=2", "evaluation.record=1"]
+EPISODES = 10
+SHORT = [
+    f"env.data.episodes={EPISODES}",
+    "env.data.max_steps=30",
+    "env.budget=26",
+    "evaluation.num_pairs=2",
+    "evaluation.record=1",
+    "refine.steps=20",
+]
 
 
 @pytest.mark.parametrize("env", ACTION_DIM)
@@ -31,4 +39,4 @@ def test_the_whole_path(env, execute, tmp_path):
     header = json.loads((data / "meta.json").read_text())
     assert header["shapes"]["action"] == [ACTION_DIM[env]]
     lengths = [json.loads(line)["length"] for line in (data / "episodes.jsonl").read_text().splitlines()]
-    assert lengths == [31] * 20, "episodes of these environments do not end at success"
+    assert lengths == [31] * EPISODES, "episodes of these environments do not end at success"

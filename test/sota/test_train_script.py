@@ -99,7 +99,7 @@ def test_a_finished_command_given_again_trains_nothing(copy, execute, files):
     assert results["training"]["resumed_at_step"] == results["training"]["steps"]
 
 
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("stop", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_run_stopped_while_collecting_records_the_same_bytes_when_repeated(
     command, environment, execute, tmp_path, stop, files
 ):

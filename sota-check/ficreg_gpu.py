@@ -1,13 +1,16 @@
 """Trains and evaluates LeWM and FICReg on TwoRoom and PushT within a slot of time; run_ficreg_gpu.sh calls it.
 
 Each run is train.py in a process of its own, which records episodes, trains, plans on frozen pairs and can be stopped
-at any moment. When time is up the one at work is stopped; the same command continues with it in the next slot.
+at any moment. When time is up the one at work is stopped; the same command continues with it in the next slot. The
+report is brought up to date every minute and after every run, so that a slot which is cut short leaves one.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import ctypes
+import functools
 import json
 import os
 import signal
@@ -17,14 +20,17 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ficreg_gpu_report import write_report
+from ficreg_gpu_report import finished, Runs, write_report, write_whole
 
 ROOT = Path(__file__).resolve().parents[1]
-TRAIN = ROOT / "sota-implementations" / "ficreg" / "train.py"
+TRAIN = ROOT / "sota-check" / "train_bare.py"
 ENVIRONMENTS, METHODS = ("two_room", "push_t"), ("lewm", "ficreg")
 TIME_IS_UP = 75  # exit code; EX_TEMPFAIL of sysexits.h
 REPORT_SECONDS = 60.0  # of a slot, kept for the profile and the pictures
 PATIENCE = 45.0  # seconds that a stopped run may take to write its checkpoint
+REFRESH = 60.0  # seconds from one report to the next
+LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None  # opened before any fork
+PR_SET_PDEATHSIG = 1
 
 TINY = [
     "device=cpu",
@@ -58,45 +64,113 @@ def main() -> int:
     parser.add_argument("--work", type=Path, required=True, help="episodes and runs")
     parser.add_argument("--out", type=Path, required=True, help="the report")
     parser.add_argument("--minutes", type=float, help="length of the slot; 10, or an hour for --dry-run")
+    parser.add_argument("--began", type=float, default=time.time(), help="when the slot began, seconds since 1970")
     parser.add_argument("--dry-run", action="store_true", help="tiny sizes, on the CPU")
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, end_slot)
     minutes = arguments.minutes if arguments.minutes is not None else 60.0 if arguments.dry_run else 10.0
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TIME_IS_UP))
-    began = time.monotonic()
+    began = time.monotonic() - max(0.0, time.time() - arguments.began)
     stop_at = began + 60 * minutes - (0.0 if arguments.dry_run else REPORT_SECONDS)
     runs = {(env, method): arguments.work / "runs" / f"{env}_{method}" for env in ENVIRONMENTS for method in METHODS}
-    with open(arguments.out / "log.txt", "a") as log:
-        failed = [where.name for (env, method), where in runs.items() if not go_on(arguments, env, method, stop_at, log)]
-    complete = all((where / "results.json").exists() for where in runs.values())
-    slots = note_slot(arguments.work / "slots.json", time.monotonic() - began)
-    profile = profile_once(arguments, next((where for where in runs.values() if (where / "results.json").exists()), None))
-    write_report(arguments.out, runs, {"complete": complete, "failed": failed, "slots": slots, "profile": profile})
-    if failed:
-        print(f"error: {', '.join(failed)} failed; the reasons are in {arguments.out / 'log.txt'}", file=sys.stderr)
+    slot = Slot(arguments.work, arguments.out, runs, began)
+    slot.report()
+    try:
+        with open(arguments.out / "log.txt", "a") as log:
+            for env, method in runs:
+                if not go_on(arguments, env, method, stop_at, log, slot):
+                    slot.failed.append(f"{env}_{method}")
+                slot.report()
+        profile_once(arguments, next((path for path in runs.values() if finished(path)), None))
+    finally:
+        slot.report()
+    slot.draw()
+    slot.report()  # the length of the slot with its pictures
+    if slot.failed:
+        print(f"error: {', '.join(slot.failed)} failed; see {arguments.out / 'log.txt'}", file=sys.stderr)
         return 1
-    print(f"report in {arguments.out}" if complete else "time is up: the same command continues", flush=True)
-    return 0 if complete else TIME_IS_UP
+    print(f"report in {arguments.out}" if slot.complete else "time is up: the same command continues", flush=True)
+    return 0 if slot.complete else TIME_IS_UP
 
 
-def go_on(arguments: argparse.Namespace, env: str, method: str, stop_at: float, log: Any) -> bool:
+def end_slot(*_: object) -> None:
+    """What SIGTERM does, once: a second one must not cut the report that the first one leads to."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    sys.exit(TIME_IS_UP)
+
+
+class Slot:
+    """What there is to report.
+
+    Args:
+        work: folder of the slots' lengths and the profile.
+        out: folder of the report.
+        runs: finished or not.
+        began: on the monotonic clock.
+    """
+
+    def __init__(self, work: Path, out: Path, runs: Runs, began: float) -> None:
+        self.work, self.out, self.runs, self.began = work, out, runs, began
+        self.failed: list[str] = []
+        self.before = json.loads((work / "slots.json").read_text()) if (work / "slots.json").exists() else []
+
+    @property
+    def complete(self) -> bool:
+        """Whether every run is finished."""
+        return all(finished(path) for path in self.runs.values())
+
+    @property
+    def profile(self) -> dict[str, Any] | None:
+        """Of a training step, once it was measured."""
+        path = self.work / "profile.json"
+        return json.loads(path.read_text()) if path.exists() else None
+
+    def report(self) -> None:
+        """Brings the length of this slot and the report up to date."""
+        slots = [*self.before, round(time.monotonic() - self.began, 1)]
+        write_whole(self.work / "slots.json", json.dumps(slots))
+        facts = {"complete": self.complete, "failed": self.failed, "slots": slots, "profile": self.profile}
+        write_report(self.out, self.runs, facts)
+
+    def draw(self) -> None:
+        """Draws the report's pictures, or says that it cannot."""
+        try:
+            from ficreg_gpu_pictures import draw_pictures
+        except ImportError as error:
+            print(f"pictures are skipped: {error}", flush=True)
+            return
+        draw_pictures(self.out, self.runs, self.profile)
+
+
+def go_on(arguments: argparse.Namespace, env: str, method: str, stop_at: float, log: Any, slot: Slot) -> bool:
     """Starts or continues a run where it is not finished and time is left; false where it failed by itself."""
     name = f"{env}_{method}"
     left = stop_at - time.monotonic()
-    if (arguments.work / "runs" / name / "results.json").exists() or left <= 0:
+    if finished(slot.runs[env, method]) or left <= 0:
         return True
     command = [sys.executable, str(TRAIN), f"env={env}", f"method={method}", "model=gpu_short", f"name={name}"]
     command += [f"runs_dir={arguments.work / 'runs'}", f"data_dir={arguments.work / 'data'}"]
-    command += TINY if arguments.dry_run else [f"collect.num_workers={os.cpu_count()}"]
+    command += TINY if arguments.dry_run else [f"collect.num_workers={len(os.sched_getaffinity(0))}"]
     print(f"{name}, {left:.0f} s left", flush=True)
     print(f"\n$ {' '.join(command)}", file=log, flush=True)
     quiet = {**os.environ, "TQDM_MININTERVAL": "10"}  # seconds between lines of a progress bar
-    process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=quiet)
+    bound = functools.partial(die_with, os.getpid())
+    process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=quiet, preexec_fn=bound)
     try:
-        return process.wait(left) == 0
-    except subprocess.TimeoutExpired:
-        return True
+        while process.poll() is None and (left := stop_at - time.monotonic()) > 0:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(min(left, REFRESH))
+            slot.report()
+        return process.poll() in (None, 0)
     finally:
         stop(process)
+
+
+def die_with(parent: int) -> None:
+    """In a new process, before its program: let it get SIGTERM as soon as its parent is gone, however that ends."""
+    if LIBC is not None:
+        LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != parent:  # gone already
+            os._exit(1)
 
 
 def stop(process: subprocess.Popen) -> None:
@@ -109,22 +183,13 @@ def stop(process: subprocess.Popen) -> None:
         process.wait()
 
 
-def note_slot(path: Path, seconds: float) -> list[float]:
-    """Adds the length of this slot to those before and returns all."""
-    slots = json.loads(path.read_text()) if path.exists() else []
-    slots.append(round(seconds, 1))
-    path.write_text(json.dumps(slots))
-    return slots
-
-
-def profile_once(arguments: argparse.Namespace, run_dir: Path | None) -> dict[str, Any] | None:
-    """The profile of a finished run's training step; measured in the first slot that has one."""
+def profile_once(arguments: argparse.Namespace, run_dir: Path | None) -> None:
+    """Measures the training step of a finished run, in the first slot that has one."""
     path = arguments.work / "profile.json"
     if run_dir is not None and not path.exists():
         from step_profile import profile  # torch, which takes seconds to import
 
-        path.write_text(json.dumps(profile(run_dir, steps=1 if arguments.dry_run else 50)))
-    return json.loads(path.read_text()) if path.exists() else None
+        write_whole(path, json.dumps(profile(run_dir, steps=1 if arguments.dry_run else 50)))
 
 
 if __name__ == "__main__":

@@ -1,20 +1,15 @@
-"""The report of ficreg_gpu.py: ficreg_gpu.json and a few small pictures in one flat folder."""
+"""The report of ficreg_gpu.py, ficreg_gpu.json: whole at any moment, whatever ends the slot that writes it."""
 
 from __future__ import annotations
 
 import csv
 import json
-import shutil
+import os
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-from matplotlib import pyplot
-
 Runs = dict[tuple[str, str], Path]  # environment and method -> folder of the run
-COLORS = {"lewm": "tab:gray", "ficreg": "tab:blue"}
+Results = dict[tuple[str, str], dict[str, Any]]
 
 
 def write_report(out: Path, runs: Runs, facts: dict[str, Any]) -> None:
@@ -23,12 +18,12 @@ def write_report(out: Path, runs: Runs, facts: dict[str, Any]) -> None:
     Args:
         out: folder of the report.
         runs: finished or not.
-        facts: further entries of ``ficreg_gpu.json``; of ``profile`` a picture is drawn.
+        facts: further entries of ``ficreg_gpu.json``.
 
     Raises:
         ValueError: two runs of one environment were evaluated on different pairs.
     """
-    results = {key: json.loads((path / "results.json").read_text()) for key, path in runs.items() if finished(path)}
+    results = read_results(runs)
     pairs: dict[str, str] = {}
     for (env, method), result in results.items():
         if pairs.setdefault(env, result[method]["pairs_hash"]) != result[method]["pairs_hash"]:
@@ -39,15 +34,19 @@ def write_report(out: Path, runs: Runs, facts: dict[str, Any]) -> None:
         "results": {f"{env}_{method}": result for (env, method), result in results.items()},
         "unfinished": {path.name: last_step(path) for path in runs.values() if not finished(path)},
     }
-    (out / "ficreg_gpu.json").write_text(json.dumps(content, indent=2) + "\n")
-    if results:
-        draw_success(results, out / "success.png")
-    draw_training(runs, out / "training.png")
-    if facts.get("profile"):
-        draw_profile(facts["profile"], out / "profile.png")
-    for env, method in results:
-        if method == "ficreg":
-            shutil.copy(runs[env, method] / "episodes.gif", out / f"{env}.gif")
+    write_whole(out / "ficreg_gpu.json", json.dumps(content, indent=2) + "\n")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Writes a file so that a kill leaves the old one or the new one, never a half."""
+    temporary = path.with_name(f"{path.name}.tmp")
+    temporary.write_text(text)
+    os.replace(temporary, path)
+
+
+def read_results(runs: Runs) -> Results:
+    """Of the runs that are finished."""
+    return {key: json.loads((path / "results.json").read_text()) for key, path in runs.items() if finished(path)}
 
 
 def finished(run_dir: Path) -> bool:
@@ -62,62 +61,9 @@ def last_step(run_dir: Path) -> int:
 
 
 def read_metrics(run_dir: Path) -> list[dict[str, str]]:
-    """Rows of a run's metrics.csv."""
+    """Rows of a run's metrics.csv, but for a last one that is being written."""
     path = run_dir / "metrics.csv"
     if not path.exists():
         return []
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def draw_success(results: dict[tuple[str, str], dict[str, Any]], target: Path) -> None:
-    """Success rates with their 95 % intervals, an environment a group, random actions as a line."""
-    environments = sorted({env for env, _ in results})
-    figure, axes = pyplot.subplots(1, len(environments), figsize=(3.2 * len(environments), 3.2), squeeze=False)
-    for axis, env in zip(axes[0], environments):
-        for place, (method, color) in enumerate(COLORS.items()):
-            if (env, method) not in results:
-                continue
-            outcome, floor = results[env, method][method], results[env, method]["random"]
-            low, high = outcome["success_interval"]
-            rate = outcome["success_rate"]
-            axis.bar(place, rate, color=color, yerr=[[rate - low], [high - rate]], capsize=4)
-            axis.axhline(floor["success_rate"], color="black", ls=":", lw=1)
-        axis.set(title=env, xticks=range(len(COLORS)), xticklabels=COLORS, ylim=(0, 1), ylabel="success rate")
-    save(figure, target)
-
-
-def draw_training(runs: Runs, target: Path) -> None:
-    """Prediction loss against the step, an environment a panel."""
-    environments = sorted({env for env, _ in runs})
-    figure, axes = pyplot.subplots(1, len(environments), figsize=(4 * len(environments), 3.2), squeeze=False)
-    for axis, env in zip(axes[0], environments):
-        for method, color in COLORS.items():
-            rows = [row for row in read_metrics(runs[env, method]) if row["split"] == "train" and row["loss_pred"]]
-            axis.plot(
-                [int(row["step"]) for row in rows], [float(row["loss_pred"]) for row in rows], label=method, color=color
-            )
-        axis.set(title=env, xlabel="step", ylabel="prediction loss", yscale="log")
-        axis.legend()
-    save(figure, target)
-
-
-def draw_profile(profile: dict[str, Any], target: Path) -> None:
-    """Shares of a step by kernel, and its figures in the title."""
-    names = list(profile["kernels"])[::-1]
-    figure, axis = pyplot.subplots(figsize=(8, 4))
-    axis.barh([name[:50] for name in names], [profile["kernels"][name] for name in names], color="tab:blue")
-    axis.set_xlabel("share of a step")
-    axis.set_title(
-        f"{profile['device']}: {1e3 * profile['step_seconds']:.1f} ms a step, {profile['share_of_peak']:.0%} of the "
-        f"{profile['dtype']} peak, loader {profile['loader_share']:.0%}",
-        fontsize=9,
-    )
-    save(figure, target)
-
-
-def save(figure: Any, target: Path) -> None:
-    """Writes a picture and lets go of it."""
-    figure.tight_layout()
-    figure.savefig(target, dpi=110)
-    pyplot.close(figure)
+    text = path.read_text()
+    return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))

@@ -25,8 +25,9 @@ from torchrl_ficreg.trainers import OfflineTrainer
 
 RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "scaling.json"
 FRAMES, ACTIONS, BATCH, EPOCHS = 4, 2, 128, 10
-# Clips of 4 frames, 5 steps apart, in the published data, and latents a predictor sees there.
-CLIPS = {"two_room": (730_809, 1), "push_t": (1_981_721, 3), "reacher": (1_820_000, 3), "cube": (1_820_000, 3)}
+# Clips in all the published data, of one frame more than the latents a predictor sees there, 5 steps apart: an episode of
+# n rows holds n - 19 of four frames, n - 9 of two.
+CLIPS = {"two_room": (830_809, 1), "push_t": (1_981_721, 3), "reacher": (1_820_000, 3), "cube": (1_820_000, 3)}
 PRESETS = {
     "cpu": ModelConfig.preset("cpu"),
     "gpu_short": ModelConfig.preset("paper", image_size=112),
@@ -48,9 +49,10 @@ def main() -> None:
     """Measures, models, prints and writes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--quick", action="store_true", help="smallest sizes only, to see it run")
-    parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--quick", action="store_true", help="smallest sizes only, to see it run; writes no default file")
+    parser.add_argument("--out", type=Path, help=f"default: {RESULT}")
     arguments = parser.parse_args()
+    out = arguments.out or (None if arguments.quick else RESULT)
     torch.set_num_threads(1)
     repeats, paper = arguments.repeats, PRESETS["paper"]
     sizes = (28, 56) if arguments.quick else (56, 112, 168, 224)
@@ -62,9 +64,13 @@ def main() -> None:
     }
     presets = {"cpu": PRESETS["cpu"]} if arguments.quick else PRESETS
     measured["presets"] = {name: measure(config, 2, repeats) for name, config in presets.items()}
+    measured["presets, 4 clips"] = {name: measure(config, 4, 1) for name, config in presets.items()}
+    rows = {name: [measured[key][name] for key in ("presets", "presets, 4 clips")] for name in presets}
+    if "gpu_short" in rows:
+        rows["gpu_short"] = measured["batch"]  # the same model, and 8 clips too
     result = {
         "measured": measured,
-        "modelled": {"gpu": GPU, "memory": memory(measured["presets"]), "runs": runs(measured["presets"])},
+        "modelled": {"gpu": GPU, "memory": memory(rows), "runs": runs(measured["presets"])},
         "machine": {
             "processor": platform.machine(),
             "threads": 1,
@@ -73,8 +79,9 @@ def main() -> None:
         },
         "settings": {"paper_parameters": parameters(paper), "repeats": repeats, "seed": 0},
     }
-    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
     report(result)
+    if out:
+        out.write_text(json.dumps(result, indent=2) + "\n")
 
 
 def replace_depth(config: ModelConfig, depth: int) -> ModelConfig:
@@ -164,12 +171,22 @@ def step_seconds(row: dict[str, Any], gpus: int) -> float:
     return max(compute, launch) + reduce
 
 
-def memory(presets: dict[str, dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Modelled bytes of training with 128 clips on one GPU: what was measured for two clips, scaled."""
-    return {
-        name: {"state": row["state_bytes"], "activations": row["kept_bytes"] / row["clips"] * BATCH}
-        for name, row in presets.items()
-    }
+def memory(rows: dict[str, list[dict[str, Any]]]) -> dict[str, dict[str, float]]:
+    """Modelled bytes of training with 128 clips on one GPU: the line through what was measured for few, drawn on.
+
+    Args:
+        rows: of each model, measurements with two numbers of clips or more.
+    """
+    result = {}
+    for name, measured in rows.items():
+        per_clip, constant = np.polyfit([row["clips"] for row in measured], [row["kept_bytes"] for row in measured], 1)
+        result[name] = {
+            "state": measured[0]["state_bytes"],
+            "constant": round(constant),
+            "per_clip": round(per_clip),
+            "activations": round(constant + per_clip * BATCH),
+        }
+    return result
 
 
 def runs(presets: dict[str, dict[str, Any]]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -108,12 +109,16 @@ def longest_kernels(trainer: OfflineTrainer, clip: Any, device: torch.device) ->
     with torch.profiler.profile(activities=activities) as trace:
         take_step(trainer, clip)
         wait_for(device)
-    spent: dict[str, float] = {}
-    for event in trace.key_averages():
-        if not cuda:
-            spent[event.key] = event.self_cpu_time_total
-        elif event.device_type == torch.autograd.DeviceType.CUDA:  # an operator repeats the time of its kernels
-            spent[event.key] = event.self_device_time_total
+    spent = seconds_by_name(trace.key_averages(), cuda)
     total = sum(spent.values()) or 1.0
     longest = sorted(spent, key=spent.__getitem__, reverse=True)[:KERNELS]
     return {name: spent[name] / total for name in longest}
+
+
+def seconds_by_name(events: Iterable[Any], cuda: bool) -> dict[str, float]:
+    """Time of its own of each kernel, or of each operator where ``cuda`` is false, each counted once."""
+    if not cuda:
+        return {event.key: event.self_cpu_time_total for event in events}
+    # On the device an operator repeats the time of its kernels, and so does a user's span, such as Optimizer.step.
+    kernels = [event for event in events if event.device_type == torch.autograd.DeviceType.CUDA]
+    return {e.key: e.self_device_time_total for e in kernels if not getattr(e, "is_user_annotation", False)}

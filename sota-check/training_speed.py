@@ -47,9 +47,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--clips", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--quick", action="store_true", help="two clips and one repeat, to see it run")
+    parser.add_argument("--quick", action="store_true", help="two clips, one repeat, to see it run; writes no default file")
     parser.add_argument("--profile", action="store_true", help="only print where the time of our step goes")
-    parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--out", type=Path, help=f"default: {RESULT}")
     arguments = parser.parse_args()
     clips, repeats = (2, 1) if arguments.quick else (arguments.clips, arguments.repeats)
     if arguments.profile:
@@ -73,7 +73,9 @@ def main() -> None:
         },
     }
     report(results)
-    arguments.out.write_text(json.dumps(results, indent=2) + "\n")
+    out = arguments.out or (None if arguments.quick else RESULT)
+    if out:
+        out.write_text(json.dumps(results, indent=2) + "\n")
 
 
 class Way:

@@ -19,8 +19,13 @@ from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from torchrl_ficreg.trainers import exit_on_signal, Preempted
+from torchrl_ficreg.trainers.distributed import launched
 
-INTERRUPTED = "interrupted: the same command continues where it stopped."
+INTERRUPTED = "interrupted: the same command continues from what is on disk."
+SWEEP_OF_PROCESSES = (  # which would meet a second time at the second job, and hang
+    "error: under torchrun a sweep is one command for each run: start torchrun once per seed, or use -m with "
+    "hydra/launcher=slurm."
+)
 CONFIG_DIR = Path(__file__).resolve().parent / "config"
 
 # What a user can cause and mend. A defect of ours shows its traceback, as does everything under HYDRA_FULL_ERROR=1.
@@ -62,6 +67,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
 
         def checked() -> None:
             arguments = get_args_parser().parse_args()
+            if arguments.multirun and launched():
+                sys.exit(SWEEP_OF_PROCESSES)
             if arguments.multirun:
                 _let_jobs_import_us()
             try:

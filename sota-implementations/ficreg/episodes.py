@@ -10,6 +10,7 @@ from sharded import record_shards
 from tqdm import tqdm
 
 from torchrl_ficreg.data import EpisodeWriter, estimate_bytes, OfflineTrajectories
+from torchrl_ficreg.data.layout import META_FILE
 from torchrl_ficreg.data.shards import open_store, shard_paths
 from torchrl_ficreg.data.space import require_space
 from torchrl_ficreg.envs import collect_episodes, make_env
@@ -42,7 +43,11 @@ def find_dataset(cfg: DictConfig) -> Path:
 
 
 def collect_dataset(cfg: DictConfig) -> Path:
-    """Records what the dataset still lacks, which may be nothing, and returns its folder."""
+    """Records what the dataset still lacks, which may be nothing, and returns its folder.
+
+    Raises:
+        ValueError: a collector of TorchRL is named, and the dataset was begun without one.
+    """
     path, data = dataset_path(cfg), cfg.env.data
     low, high, state_size = describe_env(cfg)
     meta = {
@@ -57,13 +62,16 @@ def collect_dataset(cfg: DictConfig) -> Path:
         "action_low": low,
         "action_high": high,
     }
-    if cfg.collect.collector is not None or shard_paths(path):
+    whole = (path / META_FILE).exists()  # and no shards, whatever else lies there
+    if not whole and (cfg.collect.collector is not None or shard_paths(path)):
         return record_shards(cfg, path, meta)
     # Several runs may be started at once: one of them records, the others wait for it.
     frames = cfg.collect.frames
     with EpisodeWriter(path, target_episodes=data.episodes, meta=meta, frames=frames, wait=True) as writer:
         if writer.complete:
             return path
+        if cfg.collect.collector is not None:
+            raise ValueError(f"{path} was begun without a collector: leave out collect.collector, which continues it.")
         steps = (data.episodes - writer.num_episodes) * (data.max_steps + 1)
         require_space(path, estimate_bytes(steps, cfg.model.image_size, len(low), state_size, frames=frames))
         episodes = collect_episodes(
@@ -96,8 +104,9 @@ def make_dataset(cfg: DictConfig, path: Path, split: str, **changes: Any) -> Off
         "frame_skip": cfg.model.frame_skip,
         "batch_size": cfg.optim.batch_size,
         "seed": cfg.seed,
+        "pin_memory": True,  # where there is a CUDA device
     }
-    return OfflineTrajectories(path, **{**settings, **changes})
+    return OfflineTrajectories(path.absolute(), **{**settings, **changes})
 
 
 def describe_env(cfg: DictConfig) -> tuple[list[float], list[float], int]:

@@ -20,8 +20,9 @@ _README = """{name}: a run of train.py, begun or continued by
 
     python train.py {overrides}
 
-The same command continues it after a stop of any kind (SIGTERM: it writes a checkpoint and exits with code 85), and
-evaluates it again once it has finished. Without training, with other settings of the evaluation:
+The same command continues it after a stop of any kind (SIGTERM or Ctrl-C in training: it writes a checkpoint and exits
+with code 85 or 130), and evaluates it again once it has finished. Without training, with other settings of the
+evaluation:
 
     python evaluate.py checkpoint={run_dir}
 
@@ -41,6 +42,7 @@ wandb/, tensorboard/  files of the logger, where one was asked for
 
 # Settings that change neither the weights nor how they are reached; a finished run may be given others.
 _FREE = ("collect.", "distributed.", "device", "evaluation.", "plan.", "logger.", "resume")
+_FREE += ("optim.checkpoint_activations", "optim.compile")  # which change no number
 _FREE += ("env.budget", "env.goal_offset", "env.num_workers", "env.state_unit")
 
 

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_ficreg.data import EpisodeWriter
-from torchrl_ficreg.data.shards import open_store, SHARD, shard_paths
+from torchrl_ficreg.data.shards import NUM_SHARDS, SHARD, shard_meta, SHARD_NUMBER
 from torchrl_ficreg.envs.collect import EpisodeRecorder
 from torchrl_ficreg.envs.collectors import collect_shards
 from torchrl_ficreg.envs.registry import find_entry
@@ -19,20 +19,23 @@ from torchrl_ficreg.envs.registry import find_entry
 def record_shards(cfg: DictConfig, path: Path, meta: dict[str, Any]) -> Path:
     """Records what the shards of a dataset still lack, which may be nothing, and returns their folder.
 
-    Shard w of W holds the episodes w, w + W, ...: opened together they are the dataset of one process.
+    Shard w of W holds the episodes w, w + W, ...: opened together they are the dataset of one process. W is
+    ``collect.num_workers``, at least one and at most the episodes, or what the shards that have begun say.
 
     Raises:
-        ValueError: shards are there, unfinished, and no collector is named to go on with.
+        ValueError: shards are there, unfinished, and no collector is named to go on with; or no collector wrote them.
     """
-    count = open_store(path, allow_incomplete=True).header.meta["shards"] if shard_paths(path) else cfg.collect.num_workers
-    shares = [range(shard, cfg.env.data.episodes, count) for shard in range(max(1, count))]
+    begun, total = shard_meta(path), cfg.env.data.episodes
+    count = begun[NUM_SHARDS] if begun else min(max(1, cfg.collect.num_workers), total)
+    shares = [range(shard, total, count) for shard in range(count)]
+    numbered = begun is None or SHARD_NUMBER in begun  # the first shards ever recorded are not
     with contextlib.ExitStack() as stack:
         writers = [
             stack.enter_context(
                 EpisodeWriter(
                     path / SHARD.format(shard),
                     target_episodes=len(share),
-                    meta={**meta, "shards": len(shares)},
+                    meta={**meta, NUM_SHARDS: count, **({SHARD_NUMBER: shard} if numbered else {})},
                     frames=cfg.collect.frames,
                     wait=True,
                 )
@@ -48,7 +51,7 @@ def record_shards(cfg: DictConfig, path: Path, meta: dict[str, Any]) -> Path:
         episodes = collect_shards(
             recorder(cfg), left, kind=cfg.collect.collector, options=OmegaConf.to_container(cfg.collect.options)
         )
-        with tqdm(total=cfg.env.data.episodes, initial=done, desc="collect", unit="episode", dynamic_ncols=True) as bar:
+        with tqdm(total=total, initial=done, desc="collect", unit="episode", dynamic_ncols=True) as bar:
             for shard, episode in episodes:
                 writers[shard].append(episode)
                 bar.update()

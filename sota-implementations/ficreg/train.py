@@ -9,11 +9,12 @@ Under torchrun optim.batch_size stays the number of clips of a step over all pro
 one writes all files and, when the others have ended, evaluates.
 
 An interrupted run continues when the same command is given again: after a crash or a kill from the last checkpoint,
-after SIGTERM (exit code 85) from the step it had reached.
+after SIGTERM (exit code 85) or Ctrl-C (130) in training from the step it had reached.
 """
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import torch
@@ -62,6 +63,8 @@ from torchrl_ficreg.trainers.distributed import is_main, process_group, rank, wo
 from torchrl_ficreg.trainers.offline import METRICS
 from torchrl_ficreg.trainers.parallel import check_processes
 
+NOT_THE_TRAINERS = ("batch_size", "checkpoint_activations")  # of optim: settings of the dataset, and of the networks
+
 
 @entry_point("train")
 def main(cfg: DictConfig) -> None:
@@ -107,7 +110,7 @@ def train(
             log_interval=cfg.logger.interval,
             logger=logger,
             strategy=cfg.distributed.strategy,
-            **{key: value for key, value in cfg.optim.items() if key != "batch_size"},
+            **{key: value for key, value in cfg.optim.items() if key not in NOT_THE_TRAINERS},
         )
         add_hooks(cfg, trainer)
         success = SuccessRate(
@@ -120,7 +123,7 @@ def train(
         resumed_at = trainer.step if trainer.resume(start) else 0
         if 0 < resumed_at < trainer.total_steps and is_main():
             print(f"continuing {run_dir} after step {resumed_at} of {trainer.total_steps}")
-        with stop_on_signal(trainer):
+        with stop_on_signal(trainer, signal.SIGTERM, signal.SIGINT):
             trainer.train()
     if not refinement.done and is_main():
         refine(cfg, data, model, inverse_model, refinement)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import platform
@@ -34,6 +35,7 @@ from torchrl_ficreg.data.frames import check_frame_format
 from torchrl_ficreg.evaluation import Evaluation, evaluate_mpc, StartGoalPairs, UniformPolicy
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
 from torchrl_ficreg.modules.precision import autocast, Precision, uses_bf16
+from torchrl_ficreg.modules.recompute import checkpoint_activations
 from torchrl_ficreg.trainers import CoefficientSchedule, LatentAlarm, ModelCard, OfflineTrainer, Refinement
 
 SIGREG_FALL = 0.8  # share of training after which lambda has its last value
@@ -65,6 +67,8 @@ def make_loss(
 ) -> LeWMLoss:
     """The loss of a configuration's ``method``, with SIGReg unless told otherwise."""
     networks = (model.encoder, model.predictor, inverse_model)
+    if cfg.optim.checkpoint_activations:
+        checkpoint_activations(model)
     weights = {key: value for key, value in cfg.loss.items() if key != "sigreg_start"}
     settings = {key: value for key, value in cfg.method.items() if key not in ("name", "consistency_warmup")}
     sigreg = SIGReg(seed=cfg.seed).to(next(model.parameters()).device) if sigreg is None else sigreg
@@ -140,6 +144,8 @@ def check_settings(cfg: DictConfig) -> None:
     check_horizon(cfg.plan, cfg.model.frame_skip, cfg.env.budget)
     get_device(cfg.device)
     Refinement(**cfg.refine)
+    if not isinstance(cfg.name, str):
+        raise ValueError(f"name={cfg.name} is a number, and a folder wants a name: name=run{cfg.name}, for instance.")
     if not cfg.name or Path(cfg.name).name != cfg.name or cfg.name.startswith("."):
         raise ValueError(f"name={cfg.name!r} must be the plain name of a folder; runs_dir says where that folder goes.")
     if cfg.logger.backend not in ("csv", "wandb", "tensorboard"):
@@ -212,6 +218,13 @@ def report(results: dict[str, Any], names: tuple[str, ...], where: Path) -> None
     print(f"{results[names[0]]['pairs']} frozen held-out pairs; results and pictures in {where}")
 
 
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"  # but found on the path
+
+
 def versions() -> dict[str, str]:
     """What a result depends on besides its configuration."""
     return {
@@ -219,5 +232,8 @@ def versions() -> dict[str, str]:
         "torch": torch.__version__,
         "torchrl": torchrl.__version__,
         "tensordict": tensordict.__version__,
+        "torchrl_ficreg": _version("torchrl_ficreg"),
+        "numpy": _version("numpy"),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads",
     }

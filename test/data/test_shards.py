@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, OfflineTrajectories
-from torchrl_ficreg.data.shards import open_store, ShardedStore
+from torchrl_ficreg.data.shards import open_store, shard_meta, shard_paths, ShardedStore
 
 LENGTHS = [20, 31, 25, 40, 22, 28, 33]  # of episodes 1 to 7: shards of three, two and two
 
@@ -20,11 +21,12 @@ LENGTHS = [20, 31, 25, 40, 22, 28, 33]  # of episodes 1 to 7: shards of three, t
 def sharded(tmp_path, make_episode, meta) -> Callable[..., Path]:
     """``sharded(3)`` writes the episodes in turn into three shards and returns their folder."""
 
-    def write(count: int, frames: str = "raw", shards: Sequence[int] | None = None) -> Path:
+    def write(count: int, frames: str = "raw", shards: Sequence[int] | None = None, numbered: bool = True) -> Path:
         for shard in range(count) if shards is None else shards:
             mine = range(shard, len(LENGTHS), count)
             path = tmp_path / "dataset" / f"shard-{shard}"
-            settings = {"target_episodes": len(mine), "meta": {**meta, "shards": count}, "frames": frames}
+            notes = {**meta, "shards": count, **({"shard": shard} if numbered else {})}
+            settings = {"target_episodes": len(mine), "meta": notes, "frames": frames}
             with EpisodeWriter(path, **settings) as writer:
                 for index in mine:
                     writer.append(make_episode(index + 1, LENGTHS[index]))
@@ -65,6 +67,59 @@ def test_a_list_of_folders_is_one_dataset_too(sharded, whole):
     folder = sharded(3)
     dataset = OfflineTrajectories([folder / f"shard-{n}" for n in range(3)], num_frames=2)
     assert dataset.fingerprint == OfflineTrajectories(whole, num_frames=2).fingerprint
+
+
+def test_numbered_shards_may_be_listed_in_any_order(sharded, whole):
+    folder = sharded(3)
+    ours = open_store([folder / "shard-2", folder / "shard-0", folder / "shard-1"])
+    assert ours.fingerprint == EpisodeStore.open(whole).fingerprint
+    assert "shard" not in ours.header.meta  # what is noted of all is noted of the whole
+
+
+def test_shards_without_numbers_keep_the_order_of_the_list(sharded):
+    folder = sharded(2, numbered=False)
+    ours = open_store([folder / "shard-1", folder / "shard-0"])
+    assert ours.length.tolist()[:2] == [LENGTHS[1], LENGTHS[0]]
+    assert open_store(folder).length.tolist() == LENGTHS
+
+
+def test_a_list_of_sharded_folders_opens_all_their_shards(sharded, whole, tmp_path):
+    """Two machines recorded two shards of four each."""
+    folder = sharded(4)
+    for number in (1, 3):
+        (folder / f"shard-{number}").rename((tmp_path / f"shard-{number}"))
+    assert open_store([tmp_path, folder]).fingerprint == EpisodeStore.open(whole).fingerprint
+
+
+def test_a_dataset_named_twice_is_refused(sharded, record):
+    folder, one = sharded(2), record([20])
+    for paths in ([one, one], [folder, folder / "shard-1"], [one, one.parent / "x" / ".." / one.name]):
+        with pytest.raises(ValueError, match="would be opened twice: list each once"):
+            open_store(paths)
+    shutil.copytree(folder / "shard-1", folder.parent / "copy")
+    with pytest.raises(ValueError, match="shard 1 would be opened twice: give one of each"):
+        open_store([folder, folder.parent / "copy"])
+
+
+def test_other_folders_beside_the_shards_are_left_alone(sharded, whole):
+    folder = sharded(2)
+    for name in ("shard-1.bak", "shard-x", "shard-"):
+        shutil.copytree(folder / "shard-1", folder / name)
+    assert [path.name for path in shard_paths(folder)] == ["shard-0", "shard-1"]
+    assert open_store(folder).fingerprint == EpisodeStore.open(whole).fingerprint
+
+
+def test_a_shard_without_an_episode_yet_says_how_many_there_are(sharded, tmp_path):
+    assert shard_meta(tmp_path) is None
+    folder = sharded(3, shards=[1])
+    (folder / "shard-1" / "episodes.jsonl").write_bytes(b"")
+    assert shard_meta(folder)["shards"] == 3
+
+
+def test_a_shard_that_does_not_say_how_many_there_are_is_refused(record, tmp_path):
+    shutil.copytree(record([20]), tmp_path / "other" / "shard-0")
+    with pytest.raises(ValueError, match="does not say how many shards"):
+        shard_meta(tmp_path / "other")
 
 
 def test_more_than_ten_shards_keep_their_order(sharded):

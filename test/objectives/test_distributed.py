@@ -8,20 +8,25 @@ of one process on the concatenated batch.
 from __future__ import annotations
 
 import warnings
+from types import SimpleNamespace
 
 import pytest
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
 from loss_collection import make_clip, make_loss
+from tensordict import TensorDict
 from torch import nn
 
 from torchrl_ficreg import SIGReg
 from torchrl_ficreg.modules.batch_norm import GlobalBatchNorm1d
+from torchrl_ficreg.objectives.gather import gather_clips
+from torchrl_ficreg.trainers import LatentAlarm
 
 TIMES, DIM, DTYPE = 3, 5, torch.float64
 SIZES = {2: {"equal": [8, 8], "unequal": [3, 13]}, 4: {"equal": [4, 4, 4, 4], "unequal": [2, 5, 3, 6]}}
-STEPS = ("paper", "live", "trusted", "two_steps", "lewm", "joint")  # losses that take a training step
+STEPS = ("paper", "live", "trusted", "two_steps", "lewm", "joint", "pldm")  # losses that take a training step
+MASKED_STEPS = ("paper", "pldm")
 NORMS = {
     "default": {},
     "average": {"momentum": None},
@@ -66,16 +71,42 @@ def normed(rows: slice, kind: str, length: int | None) -> dict[str, torch.Tensor
     return result | {"eval": norm.eval()(noise(*shape, seed=8)).detach()}
 
 
-def trained(name: str, rows: slice, parallel: bool) -> dict[str, torch.Tensor]:
+def make_batch(seed: int, masked: bool) -> TensorDict:
+    """Sixteen clips in float64; with masks, no transition of the first half counts and some of the others do."""
+    clip = make_clip(16, seed=seed)
+    clip["pixels"], clip["action"] = clip["pixels"].to(DTYPE) / 255, clip["action"].to(DTYPE)
+    if masked:
+        clip["mask"] = (noise(16, 3, seed=seed) > 0) & (torch.arange(16) >= 8)[:, None]
+    return clip
+
+
+def gathered(rows: slice) -> dict[str, torch.Tensor]:
+    """The shares joined again, of three types, and the gradient of a statistic of the whole."""
+    x = noise(3, 16, DIM)
+    mine = x[:, rows].clone().requires_grad_()
+    gather_clips(mine, 1).var(1).square().sum().backward()
+    shares = {str(value.dtype): gather_clips(value[:, rows], -2) for value in (x, x.bfloat16(), x > 0)}
+    return {**shares, "gradient": mine.grad}
+
+
+def watched(rows: slice) -> dict[str, torch.Tensor]:
+    """What the diagnostics of a loss and the alarm say of a batch, in float64."""
+    loss, clip = make_loss("diagnostics", dropout=0.0, consistency="trusted").to(DTYPE), make_batch(0, masked=True)[rows]
+    clip["mask"] = noise(16, 3, seed=1)[rows] > -0.5
+    result = {key: value.detach() for key, value in loss(clip).items() if key.startswith("judge")}
+    alarm = LatentAlarm(1, "fp32")
+    alarm._trainer = SimpleNamespace(_optim_count=1, loss_module=loss)
+    return result | {key: torch.tensor(value) for key, value in alarm(clip).items()}
+
+
+def trained(name: str, rows: slice, parallel: bool, masked: bool) -> dict[str, torch.Tensor]:
     """State of a loss after two steps of SGD, in float64."""
     loss = make_loss(name, dropout=0.0).to(DTYPE)
     optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)
     call = nn.parallel.DistributedDataParallel(loss) if parallel else loss
     for seed in range(2):
-        clip = make_clip(16, seed=seed)[rows]
-        clip["pixels"], clip["action"] = clip["pixels"].to(DTYPE) / 255, clip["action"].to(DTYPE)
         optimizer.zero_grad()
-        sum(call(clip).values()).backward()
+        sum(call(make_batch(seed, masked)[rows]).values()).backward()
         optimizer.step()
     return {key: value.clone() for key, value in loss.state_dict().items()}
 
@@ -91,12 +122,16 @@ def scenarios(rows: dict[str, slice], world: int) -> dict[tuple, dict[str, torch
             for length in (None, 3):
                 result["norm", sizes, kind, length] = normed(part, kind, length)
     for name in STEPS if world <= 2 else ("paper",):
-        result["step", name] = trained(name, rows["equal"], world > 1)
+        result["step", name] = trained(name, rows["equal"], world > 1, masked=False)
+    for name in MASKED_STEPS:
+        result["masked step", name] = trained(name, rows["equal"], world > 1, masked=True)
+    result["gathered",], result["watched",] = gathered(rows["equal"]), watched(rows["equal"])
     return result
 
 
 def work(rank: int, world: int, folder: str) -> None:
     warnings.simplefilter("ignore")
+    warnings.filterwarnings("error", r"torch\.distributed")  # deprecated functions
     torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=world)
     try:
@@ -170,14 +205,42 @@ def test_training_steps_are_those_of_one_process_on_the_whole_batch(ranks, singl
     """Parameters, BatchNorm statistics and generator state agree to 1e-9, on all ranks."""
     if ("step", name) not in ranks[0]:
         pytest.skip("on two processes only")
-    expected = single["step", name]
+    check_step(ranks, single, ("step", name))
+
+
+@pytest.mark.parametrize("name", MASKED_STEPS)
+def test_masks_may_leave_more_transitions_on_one_process_than_on_another(ranks, single, name):
+    """Here none at all on the first half of the processes: the steps are still those of one process."""
+    check_step(ranks, single, ("masked step", name))
+
+
+def check_step(ranks, single, key):
+    name, expected = key[1], single[key]
     start = make_loss(name, dropout=0.0).to(DTYPE).state_dict()
     moved = [key for key in expected if not start[key].equal(expected[key])]
     assert any(key.startswith("predictor_params") for key in moved)
     for rank in ranks:
-        for key, value in rank["step", name].items():
-            assert value.shape == expected[key].shape, key
-            assert value.allclose(expected[key], rtol=1e-9, atol=1e-9), key
+        for entry, value in rank[key].items():
+            assert value.shape == expected[entry].shape, entry
+            assert value.allclose(expected[entry], rtol=1e-9, atol=1e-9), entry
+
+
+def test_gathered_shares_are_the_batch_again(ranks, single):
+    """To the last bit, on every process; the average of gradients is that of one process."""
+    expected, parts = single["gathered",], [rank["gathered",] for rank in ranks]
+    gradient = torch.cat([part.pop("gradient") for part in parts], 1) / len(parts)
+    torch.testing.assert_close(gradient, expected["gradient"], rtol=1e-12, atol=1e-14)
+    for part in parts:
+        assert len(part) == 3
+        assert all(value.equal(expected[dtype]) for dtype, value in part.items())
+
+
+def test_diagnostics_are_those_of_the_global_batch(ranks, single):
+    """R² of the judge, how far it is trusted, and the state of the latents: the same numbers on every process."""
+    expected = single["watched",]
+    assert len(expected) == 7
+    for rank in ranks:
+        torch.testing.assert_close(rank["watched",], expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", NORMS)

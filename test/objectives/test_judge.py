@@ -256,6 +256,18 @@ def test_a_judge_that_always_says_the_same_is_found_out():
     torch.testing.assert_close(report["judge_r2_shuffled"], report["judge_r2_imagined"])
 
 
+@pytest.mark.parametrize("scale", [0.0, 1e-6, 1e-4])
+def test_an_action_that_hardly_varies_leaves_nothing_to_explain(scale):
+    """Its R² is 0 whatever the judge says, and so is that of a batch whose mask leaves nothing."""
+    action, guess = (torch.randn(64, 3, 4, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1))
+    action[..., 1] = 0.3 + scale * action[..., 1]
+    for name, value in judge_report(guess, action, action, None).items():
+        assert value[1] == 0
+        assert (value[[0, 2, 3]] != 0).all(), name
+    nothing = judge_report(guess, guess, action, torch.zeros(64, 3, dtype=torch.bool))
+    assert all((value == 0).all() for value in nothing.values())
+
+
 def test_masked_transitions_are_not_in_the_report():
     """Neither as the transition judged, nor as another clip's action."""
     generator = torch.Generator().manual_seed(0)

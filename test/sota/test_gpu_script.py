@@ -2,23 +2,48 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
+import re
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
+from packaging.requirements import Requirement
 
 SCRIPT = Path(__file__).resolve().parents[2] / "sota-check" / "run_ficreg_gpu.sh"
 NAMES = {f"{env}_{method}" for env in ("two_room", "push_t") for method in ("lewm", "ficreg")}
 
 
-def execute(*arguments: str, python: str = sys.executable) -> subprocess.CompletedProcess:
+def begin(*arguments: str, python: str = sys.executable) -> subprocess.Popen:
     environment = {key: value for key, value in os.environ.items() if key not in ("OUT", "PYTHONPATH")}
     environment |= {"PYTHON": python, "OMP_NUM_THREADS": "1"}
-    line = ["bash", str(SCRIPT), *arguments]
-    return subprocess.run(line, env=environment, capture_output=True, text=True, timeout=1800)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(["bash", str(SCRIPT), *arguments], env=environment, text=True, **pipes)
+
+
+def execute(*arguments: str, python: str = sys.executable) -> subprocess.CompletedProcess:
+    process = begin(*arguments, python=python)
+    stdout, stderr = process.communicate(timeout=1800)
+    return subprocess.CompletedProcess(process.args, process.returncode, stdout, stderr)
+
+
+@pytest.fixture
+def tools(monkeypatch) -> Iterator[None]:
+    """The folder of the script's own modules, which are forgotten afterwards."""
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if "/sota-" in (getattr(sys.modules[name], "__file__", None) or ""):
+            del sys.modules[name]
 
 
 def test_two_slots_make_one_report(tmp_path):
@@ -56,3 +81,102 @@ def test_a_python_without_torch_is_refused(tmp_path):
 def test_an_unknown_option_is_refused(tmp_path):
     done = execute("--wheel", str(tmp_path))
     assert done.returncode == 2 and "unknown option --wheel" in done.stderr
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_a_slot_that_is_cut_short_leaves_a_report_and_no_process(tmp_path, how):
+    process = begin("--work", str(tmp_path / "work"), "--out", str(tmp_path / "out"), "--dry-run")
+    assert process.stdout.readline().startswith("two_room_lewm")  # the first run begins
+    (child,) = await_children(process.pid)
+    process.send_signal(how)
+    process.communicate(timeout=60)
+    assert process.returncode == (75 if how == signal.SIGTERM else -how)
+    report = json.loads((tmp_path / "out" / "ficreg_gpu.json").read_text())
+    assert set(report["unfinished"]) == NAMES and len(report["slots"]) == 1
+    await_true(lambda: not Path(f"/proc/{child}").exists())
+
+
+def await_children(pid: int) -> list[str]:
+    children = Path(f"/proc/{pid}/task/{pid}/children")
+    await_true(lambda: children.read_text())
+    return children.read_text().split()
+
+
+def await_true(claim) -> None:
+    stop_at = time.monotonic() + 30
+    while not claim():
+        assert time.monotonic() < stop_at
+        time.sleep(0.05)
+
+
+def test_the_wheels_it_names_need_no_others():
+    """On Python 3.12, in the versions that it names, as far as these are installed here."""
+    named = re.findall(r"[a-zA-Z_0-9]+:([a-z0-9-]+)==([0-9.]+)", SCRIPT.read_text())
+    versions = {"torch": torch.__version__.split("+")[0], **dict(named)}
+    assert len(versions) > 30
+    for name, version in named:
+        try:
+            distribution = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        if distribution.version != version:
+            continue
+        for line in distribution.requires or []:
+            need = Requirement(line)
+            if need.marker is None or need.marker.evaluate({"python_version": "3.12", "extra": ""}):
+                assert need.specifier.contains(versions[need.name.lower().replace("_", "-")]), (name, line)
+
+
+def test_a_span_of_kernels_is_not_counted_beside_them(tools):
+    from step_profile import seconds_by_name
+
+    cuda, cpu = torch.autograd.DeviceType.CUDA, torch.autograd.DeviceType.CPU
+    rows = [("gemm", cuda, False, 3.0), ("adamw", cuda, False, 1.0), ("Optimizer.step", cuda, True, 1.0)]
+    rows += [("aten::mm", cpu, False, 3.0)]
+    events = [
+        SimpleNamespace(key=key, device_type=kind, is_user_annotation=user, self_device_time_total=spent)
+        for key, kind, user, spent in rows
+    ]
+    assert seconds_by_name(events, cuda=True) == {"gemm": 3.0, "adamw": 1.0}
+
+
+def test_without_matplotlib_the_report_comes_without_pictures(tools, tmp_path, monkeypatch, capsys):
+    from ficreg_gpu import Slot
+    from train_bare import if_it_can
+
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.delitem(sys.modules, "ficreg_gpu_pictures", raising=False)
+    slot = Slot(tmp_path, tmp_path, {("two_room", "lewm"): tmp_path / "run"}, began=time.monotonic())
+    slot.report()
+    slot.draw()
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("pictures are skipped: ")
+    assert json.loads((tmp_path / "ficreg_gpu.json").read_text())["unfinished"] == {"run": 0}
+
+    def draw() -> None:
+        import matplotlib  # noqa: F401
+
+    if_it_can(draw)()
+    assert "picture skipped" in capsys.readouterr().err
+
+
+def test_a_quick_look_at_the_costs_writes_nothing(tools, monkeypatch, capsys):
+    import scaling
+
+    row = {"image_size": 28, "frames": 8, "predictor_depth": 6, "cpu_seconds": 1.0, "operations": 1, "operators": 1}
+    row |= {"kept_bytes": 1, "state_bytes": 1}
+    monkeypatch.setattr(scaling, "measure", lambda config, clips, repeats: {**row, "clips": clips})
+    monkeypatch.setattr(scaling, "matrix_rate", lambda *args, **kwargs: 1.0)
+    monkeypatch.setattr(torch, "set_num_threads", lambda count: None)
+    monkeypatch.setattr(sys, "argv", ["scaling.py", "--quick", "--repeats", "1"])
+    before = scaling.RESULT.read_bytes()
+    scaling.main()
+    assert scaling.RESULT.read_bytes() == before and "activations" in capsys.readouterr().out
+
+
+def test_bytes_for_many_clips_are_drawn_on_from_few(tools):
+    from scaling import memory
+
+    rows = [{"clips": clips, "kept_bytes": 100 + 7 * clips, "state_bytes": 5} for clips in (2, 4, 8)]
+    expected = {"state": 5, "constant": 100, "per_clip": 7, "activations": 100 + 7 * 128}
+    assert memory({"model": rows}) == {"model": expected}

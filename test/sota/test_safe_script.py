@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 import signal
 import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 import torch
 
 from torchrl_ficreg.trainers import find_checkpoint, load_world_model
 
+SCRIPTS = Path(__file__).resolve().parents[2] / "sota-implementations" / "ficreg"
 RUN = "runs/two_room_cpu_ficreg_seed0"
 
 
@@ -70,3 +74,21 @@ def test_resume_never_refuses_what_is_there_and_a_path_begins_from_it(trained, c
     absent = execute(copy, "train.py", "name=third", "resume=nowhere")
     assert absent.returncode == 1 and "no checkpoint at nowhere" in absent.stderr
     assert not (copy / "runs" / "third").exists()
+
+
+def test_a_sweep_under_torchrun_is_refused_by_every_process_before_anything_begins(monkeypatch):
+    """The second job would meet on the store of the first, and wait for ever. One process on its own may sweep."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    start = importlib.import_module("cli").entry_point("train")(lambda config: pytest.fail("begun"))
+    monkeypatch.setattr(sys, "argv", ["train.py", "-m", "seed=0,1"])
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    for rank in "01":
+        monkeypatch.setenv("RANK", rank)
+        with pytest.raises(SystemExit) as caught:
+            start()
+        assert caught.value.code == (
+            "error: under torchrun a sweep is one command for each run: start torchrun once per seed, or use -m with "
+            "hydra/launcher=slurm."
+        )
+    sys.modules.pop("cli", None)

@@ -124,7 +124,7 @@ def test_a_run_stopped_while_collecting_records_the_same_bytes_when_repeated(
     assert index.read_bytes().count(b"\n") < 100, "the recording was over too soon"
     assert process.returncode != 0
     if stop == signal.SIGINT:
-        assert err.strip().endswith("interrupted: the same command continues where it stopped.")
+        assert err.strip().endswith("interrupted: the same command continues from what is on disk.")
         assert "Traceback" not in err
     for place in (folder, whole):
         done = execute(place, "collect.py", many)

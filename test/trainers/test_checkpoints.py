@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import random
 import shutil
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from tiny import HIGH, LOW, make_data, make_trainer, SIZES
-from torchrl.checkpoint import Checkpoint
+from tiny import HIGH, LOW, make_data, make_trainer, record, same, SIZES, weights
+from torchrl import torchrl_logger
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.data import ListStorage, ReplayBuffer
 
 from torchrl_ficreg import LatentCEMPlanner, ModelConfig, MPCPolicy, PlanConfig
+from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.trainers import find_checkpoint, load_world_model
+from torchrl_ficreg.trainers.checkpoint import latest_whole
+from torchrl_ficreg.trainers.rng import RandomState
+from torchrl_ficreg.trainers.stream import ReplayStream
 
 
 @pytest.fixture(scope="module")
@@ -143,27 +151,179 @@ def test_a_checkpoint_of_other_sizes_than_its_card_is_refused(finished, tmp_path
         load_world_model(tmp_path / "thin")
 
 
-def test_a_run_goes_on_from_the_one_before_when_the_latest_is_cut_off(finished, tmp_path):
-    """A file that a full disk cut short is no checkpoint; the previous one takes over."""
+@pytest.mark.parametrize("how", ["truncated", "flipped"])
+def test_a_run_goes_on_from_the_one_before_when_the_latest_is_damaged(finished, tmp_path, monkeypatch, how):
+    """Cut short by a full disk, or with other bytes than were written: the previous one takes over, with one warning.
+
+    Trained again, the run ends with the same weights and replaces the damaged file.
+    """
     run_dir, trainer = finished
     shutil.copytree(run_dir, tmp_path / "run")
-    latest = sorted((tmp_path / "run" / "checkpoints").iterdir())[-1]
-    damage(latest, "truncated")
+    earlier, latest = sorted((tmp_path / "run" / "checkpoints").iterdir())
+    damage(latest, how)
+    said = []
+    monkeypatch.setattr(torchrl_logger, "warning", lambda text, *_: said.append(text))
     again = make_trainer(tmp_path / "run")
     assert again.resume() and again.step == 18
+    assert said == [f"{latest} is damaged: continuing from {earlier}."]
     again.train()
     assert again.step == 27
+    assert same(weights(again), weights(trainer))
+    assert make_trainer(tmp_path / "run").resume() and len(said) == 1
 
 
-def test_a_damaged_latest_is_named_and_nothing_is_touched(finished, tmp_path):
+@pytest.mark.parametrize("how", ["truncated", "flipped"])
+def test_damaged_checkpoints_that_are_all_there_is_are_named_and_not_touched(finished, tmp_path, how):
     run_dir, _ = finished
     shutil.copytree(run_dir, tmp_path / "run")
-    latest = sorted((tmp_path / "run" / "checkpoints").iterdir())[-1]
-    damage(latest, "flipped")
+    first, last = sorted((tmp_path / "run" / "checkpoints").iterdir())
+    damage(last, how), damage(first, "flipped")
     before = snapshot(tmp_path)
-    with pytest.raises(ValueError, match=f"{latest.name} cannot be continued .* move it away"):
+    with pytest.raises(ValueError, match=f"{first.name} is damaged and there is no other checkpoint: move it away"):
         make_trainer(tmp_path / "run").resume()
     assert snapshot(tmp_path) == before
+
+
+@pytest.mark.parametrize("at", range(0, 60, 3))
+def test_a_flipped_byte_in_the_header_of_an_archive_member_is_damage_too(finished, tmp_path, at):
+    """Whatever zipfile makes of it: the run goes on from one checkpoint or the other, or says which is damaged."""
+    (tmp_path / "run").mkdir()
+    shutil.copytree(finished[0] / "checkpoints", tmp_path / "run" / "checkpoints")
+    earlier, latest = sorted((tmp_path / "run" / "checkpoints").iterdir())
+    data = bytearray(latest.read_bytes())
+    data[at] ^= 0xFF
+    latest.write_bytes(data)
+    rotation = CheckpointRotation(latest.parent, keep_last=2)
+    found = latest_whole(rotation)
+    assert found in (earlier, latest)
+    if found == latest:
+        assert make_trainer(tmp_path / "run").resume()
+
+
+def test_training_in_a_used_folder_without_resume_is_refused(finished, tmp_path):
+    """It would write every row twice and replace the checkpoints. Resumed, the finished run has nothing left to do."""
+    run_dir, _ = finished
+    before = snapshot(run_dir)
+    trainer = make_trainer(run_dir)
+    with pytest.raises(ValueError, match=r"holds checkpoints of a run: call resume\(\) .* another run_dir"):
+        trainer.train()
+    assert trainer.step == 0 and snapshot(run_dir) == before
+    trainer.resume()
+    trainer.train()
+    assert trainer.step == 27 and snapshot(run_dir) == before
+
+
+def test_other_data_of_as_many_clips_cannot_continue_a_run(finished):
+    """One value of one state differs. Fingerprints are in the checkpoint; the same data is accepted."""
+    run_dir, _ = finished
+    episodes = record()
+    episodes[0]["state"][0] += 1
+    data = OfflineTrajectories.from_episodes(episodes, split="train", num_frames=2, frame_skip=2, batch_size=16)
+    before = snapshot(run_dir)
+    with pytest.raises(ValueError, match="cannot be continued .*the checkpoint belongs to other data") as caught:
+        make_trainer(run_dir, data=data).resume()
+    assert "\n" not in str(caught.value)
+    assert snapshot(run_dir) == before
+    assert make_trainer(run_dir).resume()
+
+
+def test_a_position_without_a_fingerprint_is_taken_on_trust():
+    """Older checkpoints have none, and replay buffers of other kinds know none."""
+    buffer = make_data()
+    stream = ReplayStream(buffer, torch.device("cpu"))
+    next(iter(stream))
+    state = stream.state_dict()
+    assert state["fingerprint"] == buffer.fingerprint
+    old = {key: value for key, value in state.items() if key != "fingerprint"}
+    again = ReplayStream(make_data(), torch.device("cpu"))
+    again.load_state_dict(old)
+    assert again.replay_buffer.batches == 1
+    plain = ReplayStream(ReplayBuffer(storage=ListStorage(4), batch_size=1), torch.device("cpu"))
+    assert "fingerprint" not in plain.state_dict()
+    plain.load_state_dict({**plain.state_dict(), "fingerprint": "of something"})
+
+
+class Cuda:
+    """In the place of ``torch.cuda``'s random states: as many devices as told, each with a number for a state."""
+
+    def __init__(self, monkeypatch, devices: int, current: int = 0) -> None:
+        self.states = [torch.tensor([number], dtype=torch.uint8) for number in range(devices)]
+        for name, value in {
+            "is_available": lambda: devices > 0,
+            "is_initialized": lambda: devices > 0,
+            "device_count": lambda: devices,
+            "current_device": lambda: current,
+            "get_rng_state_all": lambda: [state.clone() for state in self.states],
+            "set_rng_state": self.set,
+        }.items():
+            monkeypatch.setattr(torch.cuda, name, value)
+
+    def set(self, state: torch.Tensor, device: int) -> None:
+        self.states[device] = state
+
+    @property
+    def numbers(self) -> list[int]:
+        return [state.item() for state in self.states]
+
+
+@pytest.fixture
+def said(monkeypatch):
+    """Warnings."""
+    texts = []
+    monkeypatch.setattr(torchrl_logger, "warning", lambda text, *_: texts.append(text))
+    return texts
+
+
+def draw() -> tuple[float, float, float]:
+    return random.random(), np.random.rand(), torch.rand(()).item()
+
+
+def test_the_state_of_the_device_trained_on_is_kept_and_goes_to_the_one_trained_on_now(monkeypatch, said):
+    """Of four, device 2 by name or as the current one; on a machine of two it is given to the current one."""
+    Cuda(monkeypatch, 4, current=2)
+    for component in (RandomState("cuda:2"), RandomState("cuda"), RandomState()):
+        state = component.state_dict()
+        assert state["cuda"].item() == 2 and "torch_cuda" not in state
+    assert "cuda" not in RandomState("cpu").state_dict()
+    here = Cuda(monkeypatch, 2, current=1)
+    RandomState("cuda:0").load_state_dict(state)
+    assert here.numbers == [2, 1]
+    here = Cuda(monkeypatch, 2, current=1)
+    RandomState().load_state_dict(state)
+    assert here.numbers == [0, 2]
+    assert not said
+
+
+@pytest.mark.parametrize(("devices", "left_out"), [(0, "cuda:0, cuda:1, cuda:2"), (2, "cuda:2"), (3, None)])
+def test_states_of_absent_devices_are_left_out_with_one_warning(monkeypatch, said, devices, left_out):
+    """Checkpoints of TorchRL's component have all devices; every other state is restored."""
+    state = GlobalRNGState().state_dict()
+    expected = draw()
+    state["torch_cuda"] = [torch.tensor([7 + number], dtype=torch.uint8) for number in range(3)]
+    here = Cuda(monkeypatch, devices)
+    RandomState("cpu").load_state_dict(state)
+    assert draw() == expected
+    assert here.numbers == [7, 8, 9][:devices]
+    assert len(said) == (left_out is not None)
+    assert left_out is None or f"random states of {left_out} are left out" in said[0]
+
+
+def test_a_run_begun_on_cuda_goes_on_where_there_is_none(finished, tmp_path, said):
+    """Random state and tensors say they come from cuda:0, as in a checkpoint made there."""
+    run_dir, trainer = finished
+    shutil.copytree(run_dir, tmp_path / "run")
+    earlier, latest = sorted((tmp_path / "run" / "checkpoints").iterdir())
+    with zipfile.ZipFile(latest) as archive:
+        members = [(info, archive.read(info)) for info in archive.infolist()]
+    with zipfile.ZipFile(latest, "w") as archive:
+        for info, content in members:
+            archive.writestr(info, content.replace(b'"device":"cpu"', b'"device":"cuda:0"'))
+    again = make_trainer(tmp_path / "run")
+    assert again.resume() and again.step == 27 and not said
+    assert same(weights(again), weights(trainer))
+    state = RandomState().state_dict()
+    RandomState("cpu").load_state_dict({**state, "cuda": torch.zeros(16, dtype=torch.uint8)})
+    assert len(said) == 1 and "random states of cuda are left out" in said[0]
 
 
 def test_litter_of_killed_processes_is_harmless_and_swept(finished, tmp_path):

@@ -12,9 +12,13 @@ from pathlib import Path
 
 import pytest
 import torch
+import torch.distributed as dist
 from ranks import make_part, num_moments, STILL, STRATEGIES, work, WORLD
 from tiny import make_data, make_trainer, same, weights
 
+from torchrl_ficreg import make_world_model
+from torchrl_ficreg.objectives import PLDMLoss
+from torchrl_ficreg.trainers import LatentAlarm, OfflineTrainer
 from torchrl_ficreg.trainers.distributed import any_process, average, from_main, is_main, process_group, world_size
 from torchrl_ficreg.trainers.parallel import check_processes
 
@@ -23,13 +27,36 @@ from torchrl_ficreg.trainers.parallel import check_processes
 SHIFTS = ("projector.layer_in.bias", "predictor_params.module.norm.bias", "projector.norm.running_mean")
 
 
+def make_pldm(run_dir: Path, rank: int, world: int, strategy: str = "ddp") -> OfflineTrainer:
+    """One epoch, with an alarm that looks at steps 1, 3, 6 and 9."""
+    torch.manual_seed(0)
+    model, inverse_model = make_world_model(STILL, action_dim=2)
+    settings = {"epochs": 1, "lr": 1e-2, "log_interval": 1, "precision": "fp32", "progress_bar": False}
+    loss, data = PLDMLoss(model.encoder, model.predictor, inverse_model, cov_coeff=1.0), make_data(part=(rank, world))
+    trainer = OfflineTrainer(loss, data, run_dir=run_dir, strategy=strategy, **settings)
+    LatentAlarm(3, "fp32", trainer.metrics_table).register(trainer)
+    return trainer
+
+
+def work_twice(rank: int, folder: Path) -> None:
+    """What ranks.py says, then PLDM."""
+    work(rank, folder)
+    dist.init_process_group("gloo", init_method=f"file://{folder}/second meeting", rank=rank, world_size=WORLD)
+    for strategy in STRATEGIES:
+        trainer = make_pldm(folder / f"pldm {strategy}", rank, WORLD, strategy)
+        trainer.train()
+        torch.save(weights(trainer), folder / f"pldm {strategy} {rank}.pt")
+    dist.barrier()
+    dist.destroy_process_group()
+
+
 @pytest.fixture(scope="module")
 def ranks(tmp_path_factory) -> tuple[Path, list[dict]]:
     """The folder of all runs on two processes, and what each process found."""
     folder = tmp_path_factory.mktemp("ranks")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["torchrl_ficreg.trainers"])
-    processes = [context.Process(target=work, args=(rank, folder)) for rank in range(WORLD)]
+    processes = [context.Process(target=work_twice, args=(rank, folder)) for rank in range(WORLD)]
     for process in processes:
         process.start()
     for process in processes:
@@ -78,6 +105,22 @@ def test_every_step_shows_the_numbers_of_the_global_batch(ranks, single, strateg
     assert [row["step"] for row in ours] == list(range(1, 28))
     names = [name for name in expected[0] if name.startswith(("loss_", "grad_norm", "learning_rate"))]
     assert len(names) == 9
+    for one, other in zip(ours, expected, strict=True):
+        assert {name: one[name] for name in names} == pytest.approx({name: other[name] for name in names}, rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_variances_and_diagnostics_are_those_of_the_global_batch(ranks, tmp_path, strategy):
+    """PLDM: weights within 1e-4 of one process, every loss term, and what the alarm finds on looking."""
+    trainer = make_pldm(tmp_path, 0, 1)
+    trainer.train()
+    found = [torch.load(ranks[0] / f"pldm {strategy} {rank}.pt") for rank in range(WORLD)]
+    assert same(*found)
+    assert distance(weights(trainer), found[0]) < 1e-4
+    ours, expected = rows(ranks[0] / f"pldm {strategy}", "train"), rows(tmp_path, "train")
+    assert [row["step"] for row in ours] == list(range(1, 10))
+    names = [name for name in expected[0] if name.startswith(("loss_", "floor_ratio", "effective_rank"))]
+    assert len(names) == 8 and "loss_cov" in names
     for one, other in zip(ours, expected, strict=True):
         assert {name: one[name] for name in names} == pytest.approx({name: other[name] for name in names}, rel=1e-3, abs=1e-4)
 

@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import pytest
 import torch
@@ -26,7 +26,15 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.record.loggers import get_logger
 
 from torchrl_ficreg.data import EpisodeWriter, OfflineTrajectories
-from torchrl_ficreg.trainers import find_checkpoint, load_world_model, Preempted, PREEMPTED, ReadError, stop_on_signal
+from torchrl_ficreg.trainers import (
+    find_checkpoint,
+    load_world_model,
+    Preempted,
+    PREEMPTED,
+    ReadError,
+    stop_on_signal,
+    SuccessRate,
+)
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +99,22 @@ def test_a_disk_that_is_nearly_full_is_noticed_before_anything_is_written(tmp_pa
     with pytest.raises(OSError, match="no room for a checkpoint .* MB needed"):
         trainer.train()
     assert not list((tmp_path / "checkpoints").iterdir())
+
+
+def test_room_is_asked_for_only_when_a_checkpoint_is_due(tmp_path, monkeypatch):
+    """A disk that is full between two checkpoints stops nothing; one look for each of the three that are written."""
+    import shutil
+
+    looks, disk_usage = [], shutil.disk_usage
+    trainer = make_trainer(tmp_path)
+
+    def look(place):
+        looks.append(trainer.step)
+        return disk_usage(place) if trainer.step % 9 == 0 else disk_usage(place)._replace(free=0)
+
+    monkeypatch.setattr(shutil, "disk_usage", look)
+    trainer.train()
+    assert looks == [9, 18, 27]
 
 
 def test_rows_of_metrics_wait_until_there_is_room(tmp_path, unbroken, warnings):
@@ -262,6 +286,126 @@ def test_sigterm_stops_after_the_step_in_progress_and_the_repeated_command_chang
         again.train()
     assert same(weights(again), unbroken)
     assert steps(tmp_path) == [4, 8, 12, 16, 20, 24, 27]
+
+
+@pytest.fixture
+def foreground():
+    """SIGINT as in a foreground job: one that a shell runs in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_writes_a_checkpoint_after_the_step_in_progress(tmp_path, unbroken, foreground):
+    """Its exit code is that of an interrupted command; the repeated one changes no bit."""
+    trainer = make_trainer(tmp_path)
+    send = lambda batch: os.kill(os.getpid(), signal.SIGINT) if trainer.step == 5 else None  # noqa: E731
+    trainer.register_op("post_optim_log", send)
+    with pytest.raises(Preempted, match="stopped by SIGINT: the same command continues") as caught:
+        with stop_on_signal(trainer, signal.SIGTERM, signal.SIGINT):
+            trainer.train()
+    assert caught.value.code == 130
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    again = make_trainer(tmp_path)
+    assert again.resume() and again.step == 5
+    again.train()
+    assert same(weights(again), unbroken)
+
+
+def test_a_second_ctrl_c_stops_at_once(tmp_path, foreground):
+    """In the middle of step 5, so that no checkpoint is written. SIGTERM may come as often as it likes."""
+    trainer = make_trainer(tmp_path)
+
+    def send(batch) -> None:
+        if trainer.step == 5:
+            for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGINT, signal.SIGINT):
+                os.kill(os.getpid(), number)
+
+    trainer.register_op("post_optim_log", send)
+    with pytest.raises(KeyboardInterrupt):
+        with stop_on_signal(trainer, signal.SIGTERM, signal.SIGINT):
+            trainer.train()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert not find_or_none(tmp_path)
+
+
+def test_a_background_job_goes_on_ignoring_ctrl_c(foreground):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with stop_on_signal(make_trainer(), signal.SIGTERM, signal.SIGINT):
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def find_or_none(run_dir):
+    return next((run_dir / "checkpoints").glob("checkpoint-*"), None)
+
+
+def evaluating(run_dir, evaluate) -> tuple:
+    """A run of 27 steps that evaluates after every nine of them; ``evaluate(trainer)`` gets the trainer."""
+    trainer = make_trainer(run_dir)
+    hook = SuccessRate(lambda: evaluate(trainer), 9, trainer.metrics_table)
+    hook.register(trainer)
+    return trainer, hook
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 85), (signal.SIGINT, 130)])
+def test_a_signal_ends_an_evaluation_at_once_and_the_epoch_is_kept(tmp_path, unbroken, foreground, number, code):
+    """The evaluation of step 18 would never end. The run stops there with a checkpoint, and ends as it should."""
+    finally_ran = []
+
+    def evaluate(trainer) -> dict[str, float]:
+        torch.rand(3)
+        try:
+            if trainer.step == 18:
+                os.kill(os.getpid(), number)
+                time.sleep(600)
+        finally:
+            finally_ran.append(trainer.step)
+        return {"success_rate": 0.5}
+
+    trainer, hook = evaluating(tmp_path, evaluate)
+    began = time.monotonic()
+    with pytest.raises(Preempted) as caught:
+        with stop_on_signal(trainer, signal.SIGTERM, signal.SIGINT):
+            trainer.train()
+    assert time.monotonic() - began < 60
+    assert caught.value.code == code
+    assert finally_ran == [9, 18]
+    assert trainer.loss_module.training
+    assert hook.metadata(trainer) == {"success_rate": -1.0}
+    rates = [Checkpoint.manifest(p)["metadata"]["success_rate"] for p in trainer.checkpoint_rotation.checkpoints()]
+    assert rates == [0.5, -1.0]
+    again, _ = evaluating(tmp_path, lambda trainer: {"success_rate": 0.25})
+    assert again.resume() and again.step == 18
+    again.train()
+    assert same(weights(again), unbroken)
+
+
+def test_an_evaluation_does_not_begin_when_a_signal_came_in_its_step(tmp_path):
+    """Time is short; a stop that a hook of the user asked for is no hurry."""
+    asked = []
+    for name, stop in (
+        ("signal", lambda trainer: os.kill(os.getpid(), signal.SIGTERM)),
+        ("hook", lambda trainer: trainer.request_stop("early")),
+    ):
+        trainer, _ = evaluating(tmp_path / name, lambda trainer, name=name: asked.append(name) or {"success_rate": 1.0})
+        at_step(trainer, 9, lambda trainer=trainer, stop=stop: stop(trainer))
+        with suppress(Preempted), stop_on_signal(trainer):
+            trainer.train()
+        assert trainer.step == 9
+    assert asked == ["hook"]
+
+
+def test_a_signal_in_an_evaluation_means_what_it_meant_before_where_nobody_stops_the_trainer(tmp_path, foreground):
+    """Ctrl-C in a notebook, say: KeyboardInterrupt, with the networks back in train mode."""
+
+    def evaluate(trainer) -> dict[str, float]:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(600)
+
+    trainer, _ = evaluating(tmp_path, evaluate)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.train()
+    assert trainer.step == 9 and trainer.loss_module.training
 
 
 def test_preempted_at_any_moment_a_process_exits_with_85_and_what_it_learned_is_kept(tmp_path):

@@ -10,6 +10,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,11 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_ficreg.data.layout import INDEX_FILE, META_FILE, parse_index
+from torchrl_ficreg.data.layout import Header, INDEX_FILE, META_FILE, parse_index
 from torchrl_ficreg.data.schema import PIXELS
 from torchrl_ficreg.data.store import EpisodeStore, Verify
 
 SHARD = "shard-{}"
+SHARD_NUMBER, NUM_SHARDS = "shard", "shards"  # what a shard notes about itself, from 0, and about all
 
 
 def open_store(
@@ -34,24 +37,27 @@ def open_store(
     """Opens a dataset directory, a directory of shards, or a list of directories.
 
     Args:
-        path: one of the three.
+        path: one of the three. Of a list, a directory of shards counts as all of them. Episodes are numbered by the
+            shards' own numbers where each notes one, else by the order of the list: another order, another split.
         allow_incomplete: see :meth:`EpisodeStore.open`.
         verify: see :meth:`EpisodeStore.open`; of each shard.
         num_threads: see :meth:`EpisodeStore.open`.
 
     Raises:
         FileNotFoundError: there is no dataset.
-        ValueError: one is damaged or incomplete, or they differ in their frames, row shapes or what they note.
+        ValueError: one is damaged, incomplete or named twice, or they differ in their frames, row shapes or what they
+            note.
     """
     options = {"allow_incomplete": allow_incomplete, "verify": verify, "num_threads": num_threads}
     folder = Path(path) if isinstance(path, (str, Path)) else None
-    paths = [Path(shard) for shard in path] if folder is None else shard_paths(folder)
-    if folder is not None and (not paths or (folder / META_FILE).exists()):
-        return EpisodeStore.open(folder, **options)
+    paths = [part for whole in ([folder] if folder else path) for part in _parts(Path(whole))]
     if not paths:
         raise ValueError("a dataset needs at least one directory, got an empty list.")
+    _refuse_twice([part.resolve() for part in paths], "list each once")
+    if paths == [folder]:
+        return EpisodeStore.open(folder, **options)
     store = ShardedStore([EpisodeStore.open(shard, **options) for shard in paths], folder)
-    want = store.header.meta.get("shards", len(paths))
+    want = store.header.meta.get(NUM_SHARDS, len(paths))
     if len(paths) != want and not allow_incomplete:
         raise ValueError(f"{path} holds {len(paths)} of {want} shards: collect the rest, or pass allow_incomplete=True.")
     return store
@@ -60,7 +66,23 @@ def open_store(
 def shard_paths(folder: Path) -> list[Path]:
     """The shards of a directory, by number: those that have begun."""
     found = [path.parent for path in folder.glob(f"{SHARD.format('*')}/{META_FILE}")]
-    return sorted(found, key=lambda path: int(path.name.rpartition("-")[2]))
+    numbered = {int(path.name.rpartition("-")[2]): path for path in found if re.fullmatch(r"shard-[0-9]+", path.name)}
+    return [path for _, path in sorted(numbered.items())]
+
+
+def shard_meta(folder: Path) -> dict[str, Any] | None:
+    """What the first shard of a directory notes, though it may hold no episode yet; None where none has begun.
+
+    Raises:
+        ValueError: the shard was not recorded as one.
+    """
+    for path in shard_paths(folder):
+        file = path / META_FILE
+        meta = Header.from_json(file.read_text(), file).meta
+        if NUM_SHARDS not in meta:
+            raise ValueError(f"{file} does not say how many shards exist: give dataset={folder} or another data_dir.")
+        return meta
+    return None
 
 
 class ShardedStore(EpisodeStore):
@@ -71,23 +93,28 @@ class ShardedStore(EpisodeStore):
     into memory; frames stay where they are.
 
     Args:
-        shards: opened stores.
+        shards: opened stores; where each notes its number they are taken in that order.
         path: the directory that holds them, if one does; frozen start-goal pairs are kept there.
 
     Raises:
-        ValueError: the shards differ in their frames, row shapes or what they note.
+        ValueError: the shards differ in their frames, row shapes or what they note, or two have the same number.
     """
 
     def __init__(self, shards: Sequence[EpisodeStore], path: Path | None = None) -> None:
-        first = shards[0].header
-        for shard in shards[1:]:
+        numbers = [shard.header.meta.get(SHARD_NUMBER) for shard in shards]
+        headers = [_without_number(shard.header) for shard in shards]
+        first = headers[0]
+        for shard, header in zip(shards[1:], headers[1:]):
             for name in ("frames", "shapes", "meta"):
-                ours, theirs = getattr(first, name), getattr(shard.header, name)
+                ours, theirs = getattr(first, name), getattr(header, name)
                 if ours != theirs:
                     raise ValueError(
                         f"shards must agree in their {name}: {shards[0].path} has {ours}, {shard.path} has {theirs}. "
                         "Open them as datasets of their own."
                     )
+        if None not in numbers:
+            _refuse_twice([f"shard {number}" for number in numbers], "give one of each")
+            shards = [shard for _, shard in sorted(zip(numbers, shards), key=lambda pair: pair[0])]
         self.shards = list(shards)
         # Stable: by place within the shard, then by shard.
         turns = sorted((place, number) for number, shard in enumerate(shards) for place in range(shard.num_episodes))
@@ -136,6 +163,22 @@ class ShardedStore(EpisodeStore):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "arrays": None}
+
+
+def _parts(folder: Path) -> list[Path]:
+    """The datasets of a directory: its shards, or itself."""
+    return [folder] if (folder / META_FILE).exists() else shard_paths(folder) or [folder]
+
+
+def _without_number(header: Header) -> Header:
+    """A shard's header as all shards have it."""
+    return replace(header, meta={key: value for key, value in header.meta.items() if key != SHARD_NUMBER})
+
+
+def _refuse_twice(names: Sequence[object], advice: str) -> None:
+    twice = [str(name) for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise ValueError(f"{', '.join(twice)} would be opened twice: {advice}.")
 
 
 def _index(shard: EpisodeStore) -> list:

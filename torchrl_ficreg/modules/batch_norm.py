@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-import torch.distributed as dist
 from torch import nn
-from torch.distributed.nn.functional import all_reduce
+
+from torchrl_ficreg.modules.collectives import num_processes, sum_over_processes
 
 
 class GlobalBatchNorm1d(nn.BatchNorm1d):
@@ -19,7 +19,7 @@ class GlobalBatchNorm1d(nn.BatchNorm1d):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """[N, C] -> [N, C], or [N, C, L] -> [N, C, L]."""
         measures = self.training or self.running_mean is None
-        if not (measures and dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1):
+        if not measures or num_processes() == 1:
             return super().forward(x)
         self._check_input_dim(x)
         if x.ndim == 3:
@@ -29,19 +29,18 @@ class GlobalBatchNorm1d(nn.BatchNorm1d):
 
     def _forward_global(self, x: torch.Tensor) -> torch.Tensor:
         wide = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
-        count = torch.full_like(wide[:1, :1], len(x))  # [1, 1]
-        dist.all_reduce(count)
-        mean = all_reduce(wide.sum(0)) / count[0]  # [C]
-        variance = all_reduce((wide - mean).square().sum(0)) / count[0]  # [C]
+        count = sum_over_processes(wide.new_full((1,), len(x)))  # [1]
+        mean = sum_over_processes(wide.sum(0)) / count  # [C]
+        variance = sum_over_processes((wide - mean).square().sum(0)) / count  # [C]
         if self.training and self.running_mean is not None:
-            self._track(mean.detach(), variance.detach(), count[0])
+            self._track(mean.detach(), variance.detach(), count)
         normed = (wide - mean) * torch.rsqrt(variance + self.eps)
         return (normed if self.weight is None else normed * self.weight + self.bias).to(x.dtype)
 
     def _track(self, mean: torch.Tensor, variance: torch.Tensor, count: torch.Tensor) -> None:
         """Moves the running statistics; a momentum of None stands for their plain average, as in torch."""
-        self.num_batches_tracked += 1
+        self.num_batches_tracked.add_(1)  # an assignment, which += is too, would break a compiled graph
         share = 1 / self.num_batches_tracked.to(mean.dtype) if self.momentum is None else self.momentum
         unbiased = variance * count / (count - 1).clamp_min(1)
-        self.running_mean += share * (mean - self.running_mean)
-        self.running_var += share * (unbiased - self.running_var)
+        self.running_mean.add_(share * (mean - self.running_mean))
+        self.running_var.add_(share * (unbiased - self.running_var))

@@ -9,6 +9,7 @@ from torch import nn
 
 from torchrl_ficreg.data.schema import ACTION, LATENT, PREDICTED_LATENT
 from torchrl_ficreg.modules.projector import Projector
+from torchrl_ficreg.modules.recompute import run_block
 from torchrl_ficreg.modules.transformer import AdaptiveBlock, Cache
 
 
@@ -77,7 +78,12 @@ class CausalTransformer(nn.Module):
         attention_dropout: of its attention weights.
         projector_dim: hidden width of the BatchNorm projector at its end.
         action_bottleneck: see :class:`ActionEmbedding`.
+
+    Attributes:
+        checkpointing: see :func:`~torchrl_ficreg.modules.recompute.checkpoint_activations`.
     """
+
+    checkpointing = False
 
     def __init__(
         self,
@@ -182,7 +188,7 @@ class CausalTransformer(nn.Module):
         latent, action = latent.reshape(-1, *latent.shape[-2:]), action.reshape(-1, *action.shape[-2:])
         x = self.to_width(latent) + self.position[:, :tokens]  # [N, T, width]
         for block, modulation in zip(self.blocks, self.modulation(action)):
-            x = block(x, modulation)
+            x = run_block(block, x, modulation, again=self.checkpointing)
         return self.projector(self.norm(x)).reshape(*lead, tokens, -1)
 
 

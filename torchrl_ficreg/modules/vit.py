@@ -11,6 +11,7 @@ from torchrl_ficreg.data.schema import LATENT, PIXELS
 from torchrl_ficreg.modules.kernels import Linear
 from torchrl_ficreg.modules.pixels import PixelNormalizer, restore_lead
 from torchrl_ficreg.modules.projector import Projector
+from torchrl_ficreg.modules.recompute import run_block
 from torchrl_ficreg.modules.transformer import Block
 
 
@@ -22,7 +23,12 @@ class VisionTransformer(nn.Module):
         width, depth, heads, mlp_dim: of the transformer.
         projector_dim: hidden width of the projector.
         latent_dim: D.
+
+    Attributes:
+        checkpointing: see :func:`~torchrl_ficreg.modules.recompute.checkpoint_activations`.
     """
+
+    checkpointing = False
 
     def __init__(
         self,
@@ -62,7 +68,7 @@ class VisionTransformer(nn.Module):
         tokens = self.to_patch(patches.permute(0, 2, 3, 1, 4, 5).flatten(3).flatten(1, 2))  # [N, P, width]
         tokens = torch.cat([self.class_token.expand(len(tokens), -1, -1), tokens], dim=1) + self.position
         for block in self.blocks[:-1]:
-            tokens = block(tokens)  # [N, P + 1, width]
+            tokens = run_block(block, tokens, again=self.checkpointing)  # [N, P + 1, width]
         token = self.blocks[-1].first(tokens)[:, 0]  # [N, width]; of the last layer nothing else is read
         return restore_lead(self.projector(self.norm(token)), pixels)
 

@@ -14,6 +14,7 @@ from torch import nn
 from torchrl.objectives.common import LossModule
 
 from torchrl_ficreg.data import schema
+from torchrl_ficreg.modules.collectives import num_processes, sum_over_processes
 from torchrl_ficreg.modules.inverse import LOG_VAR, SPREAD
 from torchrl_ficreg.objectives.clip import call, check_module, Clip, output, read_clip, require
 from torchrl_ficreg.objectives.judge import Recovered
@@ -139,14 +140,21 @@ class LatentLoss(LossModule):
         return Recovered(action, written.get(LOG_VAR, None), written.get(SPREAD, None))
 
     def _reduce(self, term: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-        """[B, T - 1] -> as the reduction says. Masked transitions are selected away, never multiplied by zero."""
+        """[B, T - 1] -> as the reduction says. Masked transitions are selected away, never multiplied by zero.
+
+        On several processes a mean is taken over the mean count of transitions, so that its average over processes is
+        the mean over the transitions of the global batch, however the masks are shared out.
+        """
         if mask is not None:
             term = torch.where(mask, term, 0.0)
         if self.reduction == "none":
             return term
         if self.reduction == "sum":
             return term.sum()
-        return term.mean() if mask is None else term.sum() / mask.sum().clamp_min(1)
+        if mask is None:
+            return term.mean()
+        count = sum_over_processes(mask.sum()).clamp_min(1)  # [], of all processes
+        return term.sum() * num_processes() / count
 
 
 def with_own_buffers(params: TensorDictParams) -> TensorDictBase:

@@ -9,6 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 
+from torchrl_ficreg.modules.collectives import sum_over_processes
+
 
 class Clip(NamedTuple):
     """The tensors of a clip.
@@ -77,7 +79,7 @@ def read_clip(tensordict: TensorDictBase, pixels: NestedKey, action: NestedKey, 
 
 
 def _check_values(blocks: torch.Tensor, mask: torch.Tensor | None) -> None:
-    if mask is not None and not mask.any():
+    if mask is not None and not sum_over_processes(mask.sum()):  # one process may well have none
         raise ValueError("the mask leaves no transition of the batch to learn from: sample other clips.")
     if not blocks.isfinite().all():
         bad = (~blocks.isfinite().all(-1)).sum().item()
@@ -133,12 +135,14 @@ def call(module: TensorDictModule, params: TensorDictBase, *inputs: torch.Tensor
         what it read and wrote.
     """
     tensordict = TensorDict(dict(zip(module.in_keys, inputs)), batch_size=inputs[0].shape[:1])
-    with params.to_module(module, preserve_module_state=False) as swap:
-        try:
-            return module(tensordict)
-        except Exception:
-            swap.__exit__(None, None, None)  # tensordict itself leaves the module with these parameters
-            raise
+    swap = params.to_module(module, preserve_module_state=False)
+    swap.__enter__()
+    # Not a with statement: after an Exception tensordict leaves the module with these parameters, and for any other, such
+    # as the KeyboardInterrupt or SystemExit of a signal handler, it puts an error of its own in the place of that one.
+    try:
+        return module(tensordict)
+    finally:
+        swap.__exit__(None, None, None)
 
 
 def output(module: TensorDictModule, tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import torch
 import torch.distributed as dist
 
+from torchrl_ficreg.modules.collectives import num_processes
+
 
 def epps_pulley(
     angle: torch.Tensor, mask: torch.Tensor | None, gaussian: torch.Tensor, weight: torch.Tensor
@@ -34,9 +36,10 @@ def _epps_pulley(
     angle: torch.Tensor, mask: torch.Tensor | None, gaussian: torch.Tensor, weight: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Statistic [T, M], z [T, B, M] complex, deviation from the Gaussian [K, T, M] complex."""
+    angle = angle.contiguous()  # a compiler lays inputs out as it likes, and is promised contiguous results
     unit = torch.polar(torch.ones_like(angle), angle)  # [T, B, M]
     if mask is not None:
-        unit = torch.where(mask.unsqueeze(-1), unit, 0.0)  # powers of zero add nothing to a sum
+        unit = torch.where(mask.unsqueeze(-1), unit, 0.0).contiguous()  # powers of zero add nothing to a sum
     total = unit.new_empty(len(gaussian), angle.shape[0], angle.shape[2])  # [K, T, M]
     for time, base in enumerate(unit):  # one time step at a time stays in the cache
         power = base.clone()  # [B, M]
@@ -45,7 +48,7 @@ def _epps_pulley(
                 power.mul_(base)
             torch.sum(power, 0, out=total[knot, time])
     count = _counts(angle, mask)
-    if _world_size() > 1:
+    if num_processes() > 1:
         dist.all_reduce(torch.view_as_real(total))
         dist.all_reduce(count)
     deviation = total / count.clamp_min(1).unsqueeze(-1) - gaussian.view(-1, 1, 1)  # [K, T, M]
@@ -73,7 +76,7 @@ def _epps_pulley_backward(
     d/d(angle) = 2 sum_k weight_k k Re(conj(deviation_k) i z^k), the factor B having cancelled the 1/B of the mean.
     """
     grad = grad.clone()
-    if _world_size() > 1:
+    if num_processes() > 1:
         dist.all_reduce(grad)
     order = torch.arange(1, len(weight) + 1, device=weight.device, dtype=weight.dtype)
     slope = (2 * order * weight).view(-1, 1, 1) * grad  # [K, T, M]
@@ -110,7 +113,3 @@ def _counts(angle: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
     if mask is not None:
         return mask.sum(1).to(angle.dtype)
     return angle.new_full((angle.shape[0],), angle.shape[1])
-
-
-def _world_size() -> int:
-    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1

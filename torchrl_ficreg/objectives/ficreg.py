@@ -11,6 +11,7 @@ from tensordict.nn import dispatch, TensorDictModule
 from torchrl_ficreg.modules.inverse import LOG_VAR
 from torchrl_ficreg.objectives.base import Reduction, with_own_buffers
 from torchrl_ficreg.objectives.clip import Clip
+from torchrl_ficreg.objectives.gather import gather_clips
 from torchrl_ficreg.objectives.judge import inverse_error, judge_report, mean_where, Recovered, trust
 from torchrl_ficreg.objectives.lewm import LeWMLoss
 from torchrl_ficreg.objectives.sigreg import SIGReg
@@ -174,7 +175,8 @@ class FICRegLoss(LeWMLoss):
         terms = {"loss_consistency": self.consistency_coeff * self._reduce(total / count.clamp_min(1), clip.mask)}
         if self.diagnostics:
             terms |= judge_report(recovered, verdict, clip.action, clip.mask)
-            terms["judge_trust"] = mean_where(weight.detach().float().flatten(0, -2), clip.mask)
+            counted = None if clip.mask is None else gather_clips(clip.mask.flatten())  # [N of all processes]
+            terms["judge_trust"] = mean_where(gather_clips(weight.detach().float().flatten(0, -2)), counted)
         return terms
 
     def _steps(self, clip: Clip) -> int:

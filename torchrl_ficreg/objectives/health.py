@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from torchrl_ficreg.objectives.gather import gather_clips
 from torchrl_ficreg.objectives.sigreg import SIGReg
 
 GAUSSIAN_FLOOR = 1.0527  # value of SIGReg on N(0, I): the integral of (1 - exp(-t^2)) exp(-t^2 / 2) over [-3, 3]
@@ -51,7 +52,7 @@ class LatentHealth:
 
 @torch.no_grad()
 def latent_health(latent: torch.Tensor, sigreg: SIGReg | None = None) -> LatentHealth:
-    """Measures a batch of latents.
+    """Measures a batch of latents; on several processes, which must all ask, the global batch of their equal shares.
 
     Args:
         latent: [T, B, D], or [B, D].
@@ -71,7 +72,8 @@ def latent_health(latent: torch.Tensor, sigreg: SIGReg | None = None) -> LatentH
         value = sigreg.eval()(latent).item()
     finally:
         sigreg.train(training)
-    flat = latent.float().flatten(0, -2)  # [N, D]
+    latent = gather_clips(latent.float(), dim=-2)  # SIGReg above has seen all processes' latents on its own
+    flat = latent.flatten(0, -2)  # [N, D]
     samples = latent.shape[-2] if sigreg.unit == "time" else len(flat)
     if not flat.isfinite().all():
         return LatentHealth(math.nan, math.nan, flat.shape[1], samples)

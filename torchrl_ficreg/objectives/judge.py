@@ -6,7 +6,10 @@ from typing import NamedTuple
 
 import torch
 
+from torchrl_ficreg.objectives.gather import gather_clips
 from torchrl_ficreg.objectives.terms import gaussian_nll, squared_error
+
+NO_VARIANCE = 1e-6  # of z-scored actions: a dimension that varies less is constant
 
 
 class Recovered(NamedTuple):
@@ -47,7 +50,7 @@ def trust(real_error: torch.Tensor) -> torch.Tensor:
 def judge_report(
     real: torch.Tensor, imagined: torch.Tensor, action: torch.Tensor, mask: torch.Tensor | None
 ) -> dict[str, torch.Tensor]:
-    """How good the judge is, per action dimension, all detached.
+    """How good the judge is, per action dimension, all detached; on several processes on the global batch.
 
     The shuffled control compares its verdicts on imagined transitions with the actions of *other* clips (the
     previous one of the batch): a judge that likes wrong actions as well is worthless, and its number there is not
@@ -59,12 +62,14 @@ def judge_report(
         mask: [..., T] bool, or None.
 
     Returns:
-        ``judge_r2_real``, ``judge_r2_imagined`` and ``judge_r2_shuffled``, each [F * A]; at most 1, and 0 or less for
-        a judge that knows nothing.
+        ``judge_r2_real``, ``judge_r2_imagined`` and ``judge_r2_shuffled``, each [F * A]; at most 1, 0 or less for a judge
+        that knows nothing, and 0 for a dimension of constant actions, where there is nothing to explain.
     """
     with torch.no_grad():
-        real, imagined, action = (value.float().flatten(0, -3) for value in (real, imagined, action))  # [B, T, F * A]
-        mask = None if mask is None else mask.flatten(0, -2)  # [B, T]
+        real, imagined, action = (
+            gather_clips(value.float().flatten(0, -3)) for value in (real, imagined, action)
+        )  # [B of all processes, T, F * A]
+        mask = None if mask is None else gather_clips(mask.flatten(0, -2))  # [B of all processes, T]
         both = None if mask is None else mask & mask.roll(1, 0)  # a masked action is no wrong action, but none
         return {
             "judge_r2_real": _explained(real, action, mask),
@@ -74,9 +79,11 @@ def judge_report(
 
 
 def _explained(guess: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """R² by dimension, [F * A]."""
     guess, truth = guess.flatten(0, -2), truth.flatten(0, -2)  # [N, F * A]
-    variance = mean_where((truth - mean_where(truth, mask)).square(), mask)
-    return 1 - mean_where((guess - truth).square(), mask) / variance.clamp_min(1e-8)
+    variance = mean_where((truth - mean_where(truth, mask)).square(), mask)  # [F * A]
+    explained = 1 - mean_where((guess - truth).square(), mask) / variance.clamp_min(NO_VARIANCE)
+    return torch.where(variance < NO_VARIANCE, 0.0, explained)
 
 
 def mean_where(value: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:

@@ -7,6 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch, TensorDictModule
 
 from torchrl_ficreg.objectives.base import LatentLoss, Reduction
+from torchrl_ficreg.objectives.gather import gather_clips
 from torchrl_ficreg.objectives.judge import inverse_error
 from torchrl_ficreg.objectives.terms import hinge_std, off_diagonal_covariance, squared_error
 
@@ -41,6 +42,9 @@ class PLDMLoss(LatentLoss):
     The clip is that of :class:`~torchrl_ficreg.LeWMLoss`. Masks apply to the terms on transitions (``loss_pred``,
     ``loss_time_sim``, ``loss_idm``); the statistics see every frame. A term with weight 0 at construction is not
     computed, whatever its weight becomes later.
+
+    On several processes (``torch.distributed`` initialised), with equal shares of the clips, variance and covariance over
+    the batch are those of the global batch. Gradients follow the convention of :class:`~torchrl_ficreg.SIGReg`.
 
     Args:
         encoder, predictor: see :class:`~torchrl_ficreg.LeWMLoss`.
@@ -114,7 +118,7 @@ class PLDMLoss(LatentLoss):
         latent = self._encode(clip.pixels)  # [B, T, D]
         before, after = latent[..., :-1, :], latent[..., 1:, :]
         predicted = self._predict(before, clip.action, self.predictor_params)  # [B, T - 1, D]
-        over_batch = latent.flatten(0, -3).transpose(0, 1)  # [T, B, D]
+        over_batch = gather_clips(latent.flatten(0, -3).transpose(0, 1), dim=1)  # [T, B of all processes, D]
         if over_batch.shape[1] < 2:
             raise ValueError("variance and covariance over the batch need at least 2 clips, got 1: use a larger batch.")
         compute = {

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 import zipfile
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+from torchrl import torchrl_logger
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
@@ -75,6 +79,52 @@ def find_checkpoint(path: Path | str, *, best: bool = False) -> Path:
     if best:
         raise FileNotFoundError(f"no checkpoint with a measured success at {path}: train with evaluation.every=1, say.")
     raise FileNotFoundError(f"no checkpoint at {path}: give a run directory that train.py made, or a checkpoint in it.")
+
+
+def latest_whole(rotation: CheckpointRotation) -> Path | None:
+    """The newest checkpoint whose bytes are those that were written, None where there is none at all.
+
+    Warns of damaged ones that are newer. Reads the whole file, to compare its checksums.
+
+    Raises:
+        ValueError: damaged ones are all there is: a new run would overwrite them.
+    """
+    known = rotation.checkpoints()
+    whole = next((path for path in reversed(known) if _is_whole(path)), None)
+    later = known if whole is None else known[known.index(whole) + 1 :]
+    for path in sorted(rotation.directory.glob(f"{rotation.prefix}-*")):
+        if path in known and path not in later:
+            continue
+        if whole is None:
+            raise ValueError(f"{path} is damaged and there is no other checkpoint: move it away to begin again.")
+        torchrl_logger.warning(f"{path} is damaged: continuing from {whole}.")
+    return whole
+
+
+def _is_whole(path: Path) -> bool:
+    if path.is_dir():
+        return True
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.testzip() is None
+    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, RuntimeError):
+        return False  # what a flipped byte makes zipfile raise depends on where it is
+
+
+def check_room(directory: Path, parameters: Iterable[torch.Tensor]) -> None:
+    """Asks for room for a checkpoint before it is written: a disk that fills up under a memory map cannot be caught.
+
+    Raises:
+        OSError: there is not enough.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    need = 2 * 4 * sum(p.numel() * p.element_size() for p in parameters)  # weights twice, two moments; staged, packed
+    free = shutil.disk_usage(directory).free
+    if free < need:
+        raise OSError(
+            f"no room for a checkpoint in {directory}: {free / 1e6:.0f} MB are free, {need / 1e6:.0f} MB needed. Make "
+            "room; the same command continues from the last checkpoint."
+        )
 
 
 def read_card(path: Path | str) -> ModelCard:

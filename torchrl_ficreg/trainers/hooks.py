@@ -82,7 +82,7 @@ class Validation(TrainerHookBase):
     Args:
         replay_buffer: clips of held-out episodes.
         interval: steps between evaluations, usually an epoch.
-        batches: batches averaged over, the same ones each time.
+        batches: batches averaged over, the same ones each time; an incomplete one only where there is no other.
         precision: as in training.
         table: where the terms are written.
     """
@@ -90,7 +90,8 @@ class Validation(TrainerHookBase):
     def __init__(
         self, replay_buffer: ReplayBuffer, interval: int, batches: int, precision: Precision, table: MetricsTable
     ) -> None:
-        self.replay_buffer, self.interval, self.batches = replay_buffer, interval, batches
+        whole = len(replay_buffer) // replay_buffer.batch_size  # the numbers of a few clips left over are mostly noise
+        self.replay_buffer, self.interval, self.batches = replay_buffer, interval, max(1, min(batches, whole))
         self.precision, self.table = precision, table
 
     @torch.no_grad()

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl import torchrl_logger
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from torchrl.objectives.common import LossModule
 from torchrl.record.loggers import Logger
 from torchrl.trainers import Trainer
@@ -17,12 +16,13 @@ from torchrl.trainers.trainers import LRSchedulerHook
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.modules.memory import keep_freed_memory
 from torchrl_ficreg.modules.precision import Precision
-from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, DAMAGES
+from torchrl_ficreg.trainers.checkpoint import check_room, CHECKPOINTS, DAMAGES, latest_whole
 from torchrl_ficreg.trainers.clock import Clock
 from torchrl_ficreg.trainers.distributed import from_main, is_main, rank, wait_for_all, world_size
 from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
 from torchrl_ficreg.trainers.meter import Meter
 from torchrl_ficreg.trainers.parallel import parallelise, Strategy
+from torchrl_ficreg.trainers.rng import RandomState
 from torchrl_ficreg.trainers.schedule import WarmupCosine
 from torchrl_ficreg.trainers.stepper import OfflineStepper
 from torchrl_ficreg.trainers.stream import ReadError, ReplayStream
@@ -52,8 +52,10 @@ class OfflineTrainer(Trainer):
     no room for a checkpoint                  stops, ``OSError``
     no room for ``metrics.csv``               warns and goes on; rows wait in memory until there is room
     the logger fails                          warns and goes on without it
-    SIGTERM, inside :class:`stop_on_signal`   writes a checkpoint after the step and exits with code 85
+    SIGTERM, inside :class:`stop_on_signal`   writes a checkpoint after the step and exits with code 85; SIGINT: 130
     SIGKILL, a crash, a power cut             continues from the last checkpoint when started again
+    the newest checkpoint is damaged          warns and continues from the one before
+    ``train()`` without ``resume()``          ``ValueError`` where the folder holds checkpoints
     ========================================  =====================================================================
 
     Args:
@@ -72,6 +74,8 @@ class OfflineTrainer(Trainer):
         logger: a TorchRL logger that receives the same numbers.
         progress_bar: show one.
         strategy: of several processes, ``"ddp"`` or ``"fsdp"``; see :mod:`~torchrl_ficreg.trainers.parallel`.
+        accumulate: parts of a batch that are learned from one after another; see :class:`OfflineStepper`.
+        compile: the loss, by ``torch.compile``.
 
     Raises:
         FloatingPointError: a loss stopped being finite, see :class:`OfflineStepper`.
@@ -97,6 +101,8 @@ class OfflineTrainer(Trainer):
         logger: Logger | None = None,
         progress_bar: bool = True,
         strategy: Strategy = "ddp",
+        accumulate: int = 1,
+        compile: bool = False,
     ) -> None:
         if epochs < 1 or lr <= 0 or weight_decay < 0 or clip_norm <= 0 or not 0 <= warmup < 1 or log_interval < 1:
             raise ValueError(
@@ -105,15 +111,20 @@ class OfflineTrainer(Trainer):
             )
         if validation_buffer is not None and validation_batches < 1:
             raise ValueError(f"validation_batches must be positive, got {validation_batches}.")
+        if accumulate < 1 or replay_buffer.batch_size % (2 * accumulate) and accumulate > 1:
+            raise ValueError(
+                f"accumulate={accumulate} must cut the {replay_buffer.batch_size} clips of a batch into equal parts of "
+                "at least 2."
+            )
         self.steps_per_epoch = replay_buffer.batches_per_epoch
         if self.steps_per_epoch * replay_buffer.batch_size > len(replay_buffer):
             raise ValueError("the last batch of an epoch is incomplete: make the training buffer with drop_last=True.")
         if getattr(loss_module, "reduction", "mean") == "none":
             raise ValueError("a loss with reduction='none' has no single number to descend: build it with 'mean'.")
-        self.total_steps = epochs * self.steps_per_epoch
+        self.total_steps, self._resumed = epochs * self.steps_per_epoch, False
         frames = replay_buffer.batch_size * replay_buffer.num_frames  # of one step
         self._check_parts(replay_buffer, validation_buffer)
-        self.parallel = parallelise(loss_module, strategy)
+        self.parallel = parallelise(loss_module, strategy, compile)
         params = self.parallel.params
         if params[0].device.type == "cpu":
             keep_freed_memory(2**31 - 1)  # the activations of a step, which the next one needs again
@@ -130,12 +141,16 @@ class OfflineTrainer(Trainer):
             optim_steps_per_batch=1,
             loss_module=loss_module.train(),
             optimizer=optimizer,
-            optimization_stepper=OfflineStepper(precision, clip_norm, self.metrics_table.due),
+            optimization_stepper=OfflineStepper(precision, clip_norm, self.metrics_table.due, accumulate),
             progress_bar=False,
             auto_log_optim_steps=False,
             log_interval=0,
             save_trainer_interval=self.steps_per_epoch * frames - 1,  # the comparison is strict
-            checkpoint=None if run_dir is None else Checkpoint(format="archive", rng=GlobalRNGState(), **(components or {})),
+            checkpoint=(
+                None
+                if run_dir is None
+                else Checkpoint(format="archive", rng=RandomState(params[0].device), **(components or {}))
+            ),
             checkpoint_rotation=rotation,
         )
         self._checkpoint_skip_warnings.add("logger")  # it has no state, on purpose
@@ -174,13 +189,13 @@ class OfflineTrainer(Trainer):
         Raises:
             ValueError: the checkpoint is damaged, or belongs to other networks, data or hooks.
         """
-        latest = None if self.checkpoint_rotation is None else self.checkpoint_rotation.latest()
-        self._look_for_damage()
+        latest = None if self.checkpoint_rotation is None else latest_whole(self.checkpoint_rotation)
         latest = from_main(start if latest is None else latest)
         if latest is not None:
             try:
                 checkpoint = Checkpoint() if self.checkpoint is None else self.checkpoint
-                self._sync_checkpoint_components(checkpoint).load(latest)
+                # Every component takes its tensors to its own device; the one they came from may not exist here.
+                self._sync_checkpoint_components(checkpoint).load(latest, map_location="cpu")
             except DAMAGES as error:
                 raise ValueError(
                     f"{latest} cannot be continued ({error}): repeat the settings it was made with, or, if it is "
@@ -194,42 +209,21 @@ class OfflineTrainer(Trainer):
                 )
             self.parallel.restored(self.optimizer)
             _align(self.optimizer)
+        self._resumed = True
         self._sweep()
         self.metrics_table.drop_after(self.step)
         return latest is not None
 
-    def _look_for_damage(self) -> None:
-        """Warns of damaged checkpoints; refuses where they are all there is, for a new run would overwrite them."""
-        if self.checkpoint_rotation is None:
-            return
-        whole = self.checkpoint_rotation.checkpoints()
-        for path in sorted(self.checkpoint_rotation.directory.glob(f"{self.checkpoint_rotation.prefix}-*")):
-            if path not in whole and not whole:
-                raise ValueError(f"{path} is damaged and there is no other checkpoint: move it away to begin again.")
-            if path not in whole:
-                torchrl_logger.warning(f"{path} is damaged: continuing from {whole[-1]}.")
-
-    def save_trainer(self, force_save: bool = False) -> None:
-        """Saves when one is due.
+    def _save_trainer(self) -> None:
+        """Saves, when :meth:`save_trainer` finds that a checkpoint is due.
 
         Raises:
             OSError: the disk has no room for it. The checkpoints already there stay as they are.
         """
-        if self.checkpoint_rotation is not None:
-            self.checkpoint_rotation.directory.mkdir(parents=True, exist_ok=True)
-            # Weights twice, two moments; staged, then packed. A disk that fills up under a memory map cannot be caught.
-            need = 2 * 4 * sum(p.numel() * p.element_size() for p in self.loss_module.parameters())
-            free = shutil.disk_usage(self.checkpoint_rotation.directory).free
-            if free < need:
-                raise OSError(
-                    f"no room for a checkpoint in {self.checkpoint_rotation.directory}: {free / 1e6:.0f} MB are free, "
-                    f"{need / 1e6:.0f} MB needed. Make room; the same command continues from the last checkpoint."
-                )
-        super().save_trainer(force_save)
-
-    def _save_trainer(self) -> None:
         with self.parallel.whole(self.optimizer):
             if is_main():
+                if self.checkpoint_rotation is not None:
+                    check_room(self.checkpoint_rotation.directory, self.loss_module.parameters())
                 try:
                     super()._save_trainer()
                 except (OSError, RuntimeError) as error:  # PyTorch reports a file that cannot grow as a RuntimeError
@@ -248,7 +242,17 @@ class OfflineTrainer(Trainer):
                 shutil.rmtree(left) if left.is_dir() else left.unlink()
 
     def train(self) -> None:
-        """Runs to the end, or not at all when the resumed run had reached it."""
+        """Runs to the end, or not at all when the resumed run had reached it.
+
+        Raises:
+            ValueError: there are checkpoints of a run, and :meth:`resume` was not called.
+        """
+        rotation, begun = self.checkpoint_rotation, self.step > 0 or self._resumed
+        if rotation is not None and not begun and any(rotation.directory.glob(f"{rotation.prefix}-*")):
+            raise ValueError(
+                f"{rotation.directory} holds checkpoints of a run: call resume() before train() to continue it, or "
+                "give another run_dir."
+            )
         if self.step < self.total_steps:
             self.clock.start()
             try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Literal
@@ -24,30 +25,36 @@ class ReplicatedLoss:
     """Every process holds all weights; gradients are averaged over processes (DDP). One process: the loss as it is.
 
     The losses of the collection are means over clips, or statistics of the global batch whose gradients follow the
-    same convention, so the average of gradients is the gradient of the whole batch. That needs equal shares and, where
-    clips have a mask, as many transitions that count on every process; clips of recorded episodes fulfil both.
+    same convention, so the average of gradients is the gradient of the whole batch. That needs equal shares; masks may
+    leave more transitions on one process than on another.
 
     Args:
         loss_module: on its device, the same weights on every process.
+        compile: by ``torch.compile``, encoder, predictor and terms together.
 
     Attributes:
         params: what the optimiser holds.
     """
 
-    def __init__(self, loss_module: LossModule) -> None:
+    def __init__(self, loss_module: LossModule, compile: bool = False) -> None:
         self.loss_module = loss_module
         self.params = [p for p in loss_module.parameters() if p.requires_grad]
         self._seed = torch.initial_seed()
-        self._call = self._wrap(_AsDictionary(loss_module))
+        loss = _AsDictionary(loss_module)
+        if compile:
+            loss.compile()
+        self._call = self._wrap(loss)
 
     def _wrap(self, loss: nn.Module) -> nn.Module:
         if not together():
             return loss
         # Buffers: BatchNorm statistics and SIGReg's counter are the same everywhere by construction. A static graph
         # allows for networks that a coefficient of zero leaves without gradient.
-        return nn.parallel.DistributedDataParallel(
-            loss, broadcast_buffers=False, gradient_as_bucket_view=True, static_graph=True
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # its new name does not exist before torch 2.13
+            return nn.parallel.DistributedDataParallel(
+                loss, broadcast_buffers=False, gradient_as_bucket_view=True, static_graph=True
+            )
 
     def __call__(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
         """The output of the loss on this process's share of a batch, ready for a backward pass."""
@@ -91,6 +98,7 @@ class ShardedLoss(ReplicatedLoss):
 
     Args:
         loss_module: as above. Its parameters, and those of its networks, become other objects.
+        compile: as above.
     """
 
     def _wrap(self, loss: nn.Module) -> nn.Module:
@@ -164,20 +172,22 @@ def check_processes(strategy: Strategy, batch_size: int) -> None:
     if strategy not in ("ddp", "fsdp"):
         raise ValueError(f"unknown distributed.strategy {strategy!r}: choose 'ddp' or 'fsdp'.")
     ranks = max(world_size(), int(os.environ["WORLD_SIZE"]) if launched() else 1)
-    if batch_size % ranks:
+    if batch_size % ranks or 0 < batch_size < 2 * ranks:
         raise ValueError(
-            f"optim.batch_size={batch_size} counts the clips of all {ranks} processes: give a multiple of {ranks}."
+            f"optim.batch_size={batch_size} counts the clips of all {ranks} processes: give a multiple of {ranks}, and "
+            "at least 2 for each."
         )
 
 
-def parallelise(loss_module: LossModule, strategy: Strategy = "ddp") -> ReplicatedLoss:
+def parallelise(loss_module: LossModule, strategy: Strategy = "ddp", compile: bool = False) -> ReplicatedLoss:
     """The loss as this process shall call it.
 
     Raises:
         ValueError: an unknown strategy, or weights that FSDP cannot shard.
     """
     check_processes(strategy, 0)
-    return ShardedLoss(loss_module) if strategy == "fsdp" and together() else ReplicatedLoss(loss_module)
+    kind = ShardedLoss if strategy == "fsdp" and together() else ReplicatedLoss
+    return kind(loss_module, compile)
 
 
 class _AsDictionary(nn.Module):

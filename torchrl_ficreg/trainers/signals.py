@@ -1,4 +1,4 @@
-"""A job that is told to make room (SIGTERM) stops at the next step, in good order."""
+"""A job that is told to make room (SIGTERM), or is interrupted (Ctrl-C), stops at the next step, in good order."""
 
 from __future__ import annotations
 
@@ -12,15 +12,23 @@ from torchrl.trainers import Trainer
 from torchrl_ficreg.trainers.distributed import any_process, together
 
 # Told apart from success, from an error (1) and from a death by the signal (143): start the same command again. It is
-# the number that HTCondor takes for "wrote a checkpoint", and that a SLURM script can ask for before `scontrol requeue`.
+# the number that HTCondor takes for "wrote a checkpoint", and that a SLURM script can ask for before
+# `scontrol requeue`. Under torchrun the launcher itself exits with 1.
 PREEMPTED = 85
+_INTERRUPTED = 128 + signal.SIGINT  # what a shell shows for a command that Ctrl-C ended
 
 
 class Preempted(SystemExit):
-    """Ends the process with exit code :data:`PREEMPTED`; what it was doing continues when the command is repeated."""
+    """Ends the process in good order; what it was doing continues when the command is repeated.
+
+    The exit code is :data:`PREEMPTED`, 85, and 130 after SIGINT. Under torchrun the launcher itself exits with 1.
+
+    Args:
+        signum: the signal received.
+    """
 
     def __init__(self, signum: int) -> None:
-        super().__init__(PREEMPTED)
+        super().__init__(_INTERRUPTED if signum == signal.SIGINT else PREEMPTED)
         self.signal = signal.Signals(signum)
 
     def __str__(self) -> str:
@@ -28,7 +36,10 @@ class Preempted(SystemExit):
 
 
 class _Handler:
-    """Installs itself for some signals, in the main thread, between ``__enter__`` and ``__exit__``."""
+    """Installs itself for some signals, in the main thread, between ``__enter__`` and ``__exit__``.
+
+    A signal that the process ignores stays ignored: shells have their background jobs ignore SIGINT.
+    """
 
     def __init__(self, signals: tuple[int, ...]) -> None:
         self._signals, self._before = signals, {}
@@ -36,7 +47,8 @@ class _Handler:
     def __enter__(self) -> _Handler:
         self._pid = os.getpid()
         if threading.current_thread() is threading.main_thread():  # Python allows handlers nowhere else
-            self._before = {number: signal.signal(number, self._receive) for number in self._signals}
+            heard = [number for number in self._signals if signal.getsignal(number) is not signal.SIG_IGN]
+            self._before = {number: signal.signal(number, self._receive) for number in heard}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -74,9 +86,10 @@ class exit_on_signal(_Handler):  # noqa: N801 (reads as a statement, like contex
 
 
 class stop_on_signal(_Handler):  # noqa: N801
-    """Context around :meth:`OfflineTrainer.train`: a signal lets the step in progress finish and a checkpoint be written.
+    """Context around :meth:`OfflineTrainer.train`: on a signal the step in progress ends, and a checkpoint is written.
 
-    Where several processes train, all of them stop after the same step, whichever received the signal first.
+    Where several processes train, all of them stop after the same step, whichever received the signal first. Among the
+    signals may be SIGINT: a second Ctrl-C then stops a process on its own at once.
 
     Args:
         trainer: to be stopped.
@@ -84,6 +97,7 @@ class stop_on_signal(_Handler):  # noqa: N801
 
     Raises:
         Preempted: on leaving, when a signal was received. Nothing is raised in its place where training failed.
+        KeyboardInterrupt: at once, at a second SIGINT.
     """
 
     def __init__(self, trainer: Trainer, *signals: int) -> None:
@@ -94,6 +108,9 @@ class stop_on_signal(_Handler):  # noqa: N801
             trainer.register_op("post_steps", self._agree)
 
     def _handle(self, number: int) -> None:
+        # torchrun passes on a Ctrl-C that its processes have received already, so that among them two may be one.
+        if self._alone and number == self._received == signal.SIGINT:
+            raise KeyboardInterrupt
         self._received = number
         if self._alone:
             self._trainer.request_stop(signal.Signals(number).name)
@@ -108,3 +125,8 @@ class stop_on_signal(_Handler):  # noqa: N801
         super().__exit__()
         if kind is None and self._received:
             raise Preempted(self._received)
+
+
+def told_to_stop(trainer: Trainer) -> bool:
+    """Whether a signal has asked the trainer to stop after this step: time is short then."""
+    return trainer._stop_training and trainer._stop_reason in signal.Signals.__members__

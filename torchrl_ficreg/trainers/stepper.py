@@ -20,6 +20,8 @@ class OfflineStepper(OptimizationStepper):
         precision: see :func:`~torchrl_ficreg.modules.precision.autocast`.
         clip_norm: largest gradient norm over all parameters.
         norms_due: says at which step the gradient norms of the single networks are wanted besides the norm of all.
+        accumulate: equal parts of a batch that go through the networks one after another before the one update, to save
+            memory. Statistics over clips (SIGReg, BatchNorm) are those of a part, not of the batch.
 
     Raises:
         FloatingPointError: a loss or a gradient is not finite. No weight is updated; the message names the step, the
@@ -31,18 +33,18 @@ class OfflineStepper(OptimizationStepper):
         precision: Precision = "auto",
         clip_norm: float = 1.0,
         norms_due: Callable[[int], bool] = lambda step: False,
+        accumulate: int = 1,
     ) -> None:
-        self.precision, self.clip_norm, self.norms_due = precision, clip_norm, norms_due
+        self.precision, self.clip_norm, self.norms_due, self.accumulate = precision, clip_norm, norms_due, accumulate
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         """Takes one step and returns the detached terms, ``grad_norm`` before clipping and ``learning_rate``.
 
         Where they are due, ``grad_norm_encoder`` and so on for every network, before clipping too.
         """
-        params = [p for group in trainer.optimizer.param_groups for p in group["params"]]
-        with autocast(params[0].device, self.precision):
-            output = trainer.parallel(sub_batch, trainer._optim_count)
-        sum(_terms(output).values()).backward()
+        parts = sub_batch.chunk(self.accumulate)
+        outputs = [self._backward(trainer, part, number) for number, part in enumerate(parts)]
+        output = {key: torch.stack([part[key] for part in outputs]).mean(0) for key in outputs[0]}
         norms = module_norms(trainer) if self.norms_due(trainer._optim_count) else {}
         grad_norm = trainer.parallel.clip(self.clip_norm)
         output = average(output)
@@ -55,6 +57,14 @@ class OfflineStepper(OptimizationStepper):
         trainer.optimizer.zero_grad()
         trainer.parallel.updated()
         return TensorDict({**output, **norms, "grad_norm": grad_norm.detach(), "learning_rate": rate})
+
+    def _backward(self, trainer: Trainer, clips: TensorDictBase, number: int) -> dict[str, torch.Tensor]:
+        """Adds a part's share to the gradients; the detached output of the loss."""
+        device = trainer.optimizer.param_groups[0]["params"][0].device
+        with autocast(device, self.precision):
+            output = trainer.parallel(clips, trainer._optim_count * self.accumulate + number)
+        (sum(_terms(output).values()) / self.accumulate).backward()
+        return {key: value.detach() for key, value in output.items()}
 
     @staticmethod
     def _describe(trainer: Trainer, terms: dict[str, torch.Tensor]) -> str:

@@ -12,6 +12,8 @@ from torchrl.data import ReplayBuffer
 
 from torchrl_ficreg.trainers.files import FileWatch
 
+_FINGERPRINT = "fingerprint"  # of a dataset: attribute of the buffer, key of the state
+
 
 class ReadError(OSError):
     """A batch could not be read. Nothing was learned from it, and the state before it is whole."""
@@ -21,7 +23,8 @@ class ReplayStream:
     """An endless stream of batches in the place of a collector; the position in the data is its whole state.
 
     Args:
-        replay_buffer: clips; its ``state_dict`` is a position.
+        replay_buffer: clips; its ``state_dict`` is a position. A ``fingerprint`` of its data, where it has one, is kept
+            with the position.
         device: where batches go. Frames travel as uint8.
 
     Attributes:
@@ -37,6 +40,7 @@ class ReplayStream:
         self.replay_buffer, self.device = replay_buffer, device
         self.waited = 0.0
         self._files = FileWatch.of(replay_buffer)
+        self._fingerprint = getattr(replay_buffer, _FINGERPRINT, None)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         while True:
@@ -50,16 +54,23 @@ class ReplayStream:
             yield batch
 
     def state_dict(self) -> dict[str, Any]:
-        """The position: batches handed out, and of how many clips and which size."""
-        return self.replay_buffer.state_dict()
+        """The position: batches handed out, and of how many clips, which size and, where it is known, which data."""
+        known = {} if self._fingerprint is None else {_FINGERPRINT: self._fingerprint}
+        return {**self.replay_buffer.state_dict(), **known}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continues after the batches already handed out.
 
         Raises:
-            ValueError: the position belongs to another number of clips or another batch size.
+            ValueError: the position belongs to another number of clips, another batch size or other data.
         """
-        self.replay_buffer.load_state_dict(state_dict)
+        position = dict(state_dict)
+        theirs = position.pop(_FINGERPRINT, None)  # older checkpoints have none
+        self.replay_buffer.load_state_dict(position)
+        if theirs is not None and self._fingerprint is not None and theirs != self._fingerprint:
+            raise ValueError(
+                f"the checkpoint belongs to other data: fingerprint {theirs[:12]}, here it is {self._fingerprint[:12]}."
+            )
 
     def set_seed(self, seed: int) -> int:
         """The sampler carries its own seed."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -12,10 +11,11 @@ from torchrl.trainers import Trainer, TrainerHookBase
 
 from torchrl_ficreg.modules.precision import autocast, Precision
 from torchrl_ficreg.objectives.base import LatentLoss
+from torchrl_ficreg.objectives.gather import gather_clips
 from torchrl_ficreg.objectives.health import latent_health
 from torchrl_ficreg.objectives.sigreg import SIGReg
 from torchrl_ficreg.objectives.vicreg import TemporalStraightness
-from torchrl_ficreg.trainers.distributed import is_main, world_size
+from torchrl_ficreg.trainers.distributed import is_main
 from torchrl_ficreg.trainers.hooks import MetricsTable
 
 
@@ -24,7 +24,8 @@ class LatentAlarm(TrainerHookBase):
 
     Clips of three frames and more give a third number, ``straightness``: the mean cosine between successive steps in
     latent space, 1 on a straight path. See :func:`~torchrl_ficreg.objectives.latent_health` for the others. Nothing about
-    the run is changed by looking: no random number is used up and no running statistic moved.
+    the run is changed by looking: no random number is used up and no running statistic moved. On several processes every
+    one looks at the same steps, and all report the numbers of the global batch.
 
     Args:
         interval: steps between looks; the first step is one.
@@ -47,12 +48,12 @@ class LatentAlarm(TrainerHookBase):
         with autocast(batch.device or "cpu", self.precision):
             latent = loss.peek(batch)  # [T, B, D]
         health = latent_health(latent, SIGReg().to(latent.device))
-        health = replace(health, samples=health.samples * world_size())  # SIGReg is that of the global batch
         if health.alarm is not None and step != 1 and is_main():  # at the very start nothing has been learned yet
             torchrl_logger.warning(f"step {step}: {health.alarm}")
         numbers = {"floor_ratio": health.floor_ratio, "effective_rank": health.effective_rank}
         if len(latent) >= 3:
-            numbers["straightness"] = TemporalStraightness()(latent.float().transpose(0, 1)).item()  # [B, T, D] -> []
+            clips = gather_clips(latent.float().transpose(0, 1))  # [B of all processes, T, D]
+            numbers["straightness"] = TemporalStraightness()(clips).item()
         self._keep(numbers)
         return self._numbers
 

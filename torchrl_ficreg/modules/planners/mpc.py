@@ -67,10 +67,13 @@ class MPCPolicy(TensorDictModuleBase):
         memory["cursor"] = step + 1
         if not tensordict.ndim:
             action, memory = action[0], memory[0]
-        return tensordict.set(ACTION, action).set("mpc", memory)
+        return tensordict.set(ACTION, action.to(td[PIXELS].device)).set("mpc", memory)
 
     def _memory(self, td: TensorDictBase) -> TensorDict:
-        """A copy of the memory, with fresh environments marked as used up."""
+        """A copy of the memory, with fresh environments marked as used up.
+
+        Counts lie where the environments are, which ask for them at every step; all else on the model's device.
+        """
         config, model = self.planner.config, self.planner.world_model
         actions, envs, past = config.receding_horizon * model.frame_skip, len(td), self.planner.context - 1
         memory = td.get("mpc", None)
@@ -115,7 +118,7 @@ class MPCPolicy(TensorDictModuleBase):
         """Memory of environments that are about to leave the frames of latents [e, D] by their next block."""
         model, past = self.planner.world_model, memory["past_latent"].shape[1]
         rows = torch.arange(len(latent), device=latent.device).unsqueeze(1)
-        steps = memory["cursor"].unsqueeze(1) + torch.arange(model.frame_skip, device=latent.device)  # [e, F]
+        steps = memory["cursor"].unsqueeze(1).to(latent.device) + torch.arange(model.frame_skip, device=latent.device)  # [e, F]
         block = model.statistics.normalize(memory["queue"][rows, steps]).flatten(1)  # [e, F * A]
         memory["past_latent"] = torch.cat([memory["past_latent"], latent.unsqueeze(1)], dim=1)[:, 1:]
         memory[PAST_ACTION] = torch.cat([memory[PAST_ACTION], block.unsqueeze(1)], dim=1)[:, 1:]
@@ -153,7 +156,7 @@ class MPCPolicy(TensorDictModuleBase):
         """The blocks of the last plan that were not executed, then mean actions: [e, horizon, F * A]."""
         last, executed = memory[PLAN], self.planner.config.receding_horizon
         rest = torch.cat([last[:, executed:], torch.zeros_like(last[:, :executed])], dim=1)
-        begun = (memory["count"] > 0)[:, None, None]
+        begun = (memory["count"] > 0)[:, None, None].to(rest.device)
         return torch.where(begun, rest, 0.0) if self.planner.config.warm_start else torch.zeros_like(rest)
 
 

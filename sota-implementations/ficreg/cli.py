@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib.util
 import os
 import sys
 from collections.abc import Callable
@@ -11,9 +12,11 @@ from pathlib import Path
 import hydra
 from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
@@ -26,6 +29,8 @@ SWEEP_OF_PROCESSES = (  # which would meet a second time at the second job, and 
     "error: under torchrun a sweep is one command for each run: start torchrun once per seed, or use -m with "
     "hydra/launcher=slurm."
 )
+SWEEP_WITH_FAILURES = "error: not all runs of the sweep succeeded; the same command leaves those that did as they are."
+LAUNCHERS = {"processes": ("hydra_joblib_launcher", "sweep"), "slurm": ("hydra_submitit_launcher", "slurm")}
 CONFIG_DIR = Path(__file__).resolve().parent / "config"
 
 # What a user can cause and mend. A defect of ours shows its traceback, as does everything under HYDRA_FULL_ERROR=1.
@@ -41,8 +46,14 @@ MISTAKES = (
 )
 
 
+class JobFailed(Exception):
+    """One run of a sweep; what went wrong has been said. The others go on."""
+
+
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
     """Decorates the main function of a script: Hydra in front, one-line errors around it."""
+
+    wanted_whole = os.environ.get("HYDRA_FULL_ERROR") == "1"
 
     def decorate(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         def run(config: DictConfig) -> None:
@@ -57,10 +68,14 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
                 _close_bars()
                 sys.exit(INTERRUPTED)
             except MISTAKES as error:
-                if os.environ.get("HYDRA_FULL_ERROR") == "1":
+                if wanted_whole:
                     raise
                 _close_bars()
-                sys.exit(f"error: {_one_line(error)}")
+                line = f"error: {_one_line(error)}"
+                if HydraConfig.get().mode != RunMode.MULTIRUN:
+                    sys.exit(line)
+                print(f"{line} (run {config.get('name')})", file=sys.stderr)
+                raise JobFailed(line) from None
 
         run.__module__ = main.__module__
         start = hydra.main(config_path=str(CONFIG_DIR), config_name=config_name, version_base="1.3")(run)
@@ -71,12 +86,16 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
                 sys.exit(SWEEP_OF_PROCESSES)
             if arguments.multirun:
                 _let_jobs_import_us()
+                os.environ["HYDRA_FULL_ERROR"] = "1"  # lets JobFailed through to here
             try:
+                check_launcher(arguments.overrides)
                 check_overrides(config_name, arguments.overrides)
             except (ValueError, HydraException, OmegaConfBaseException) as error:
                 sys.exit(f"error: {_one_line(error)}")
             try:
                 start()  # what it raises has been put into words, or is wanted whole (HYDRA_FULL_ERROR)
+            except JobFailed:
+                sys.exit(SWEEP_WITH_FAILURES)
             except KeyboardInterrupt:
                 sys.exit(INTERRUPTED)
 
@@ -89,6 +108,25 @@ def _let_jobs_import_us() -> None:
     """A job of a sweep is unpickled in a process that was not started with this folder's scripts."""
     inherited = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join([str(CONFIG_DIR.parent), *([inherited] if inherited else [])])
+
+
+def check_launcher(arguments: list[str]) -> None:
+    """Refuses a launcher whose package is missing.
+
+    Raises:
+        ValueError: with the package's name.
+    """
+    for argument in arguments:
+        plugin, extra = LAUNCHERS.get(argument.removeprefix("hydra/launcher="), (None, None))
+        if plugin is not None and not _installed(f"hydra_plugins.{plugin}"):
+            raise ValueError(f"{argument} needs a package: pip install 'torchrl_ficreg[{extra}]'.")
+
+
+def _installed(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # not even the package around it
+        return False
 
 
 def check_overrides(config_name: str, arguments: list[str]) -> None:

@@ -78,7 +78,7 @@ def test_the_papers_planning_belongs_to_cem_alone():
     ("launcher", "plugin"), [("slurm", "hydra_submitit_launcher"), ("processes", "hydra_joblib_launcher")]
 )
 def test_launchers_are_known_and_name_what_they_need(launcher, plugin):
-    """With its package a launcher is Hydra's; without it Hydra says which option is missing."""
+    """With its package a launcher is Hydra's; without it one line says what to install."""
     try:
         cfg = config(f"hydra/launcher={launcher}", hydra=True)
     except MissingConfigException as error:
@@ -107,3 +107,13 @@ def test_a_sweep_over_seeds_makes_a_run_of_each(command, environment, tmp_path, 
     results = [json.loads((tmp_path / "runs" / name / "results.json").read_text()) for name in folders]
     assert results[0]["ficreg"]["pairs_hash"] == results[1]["ficreg"]["pairs_hash"]
     assert (tmp_path / "runs" / folders[0] / "checkpoints").is_dir()
+
+
+@pytest.mark.slow
+def test_a_run_that_fails_does_not_stop_the_others(command, environment, tmp_path):
+    small = ("evaluation.num_pairs=2", "evaluation.record=1", "name=lr${optim.lr}")
+    line = command("train.py", "optim.lr=-1,5e-4", *small, "-m")
+    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1 and "(run lr-1" in done.stderr and "Traceback" not in done.stderr
+    assert done.stderr.strip().splitlines()[-1].startswith("error: not all runs of the sweep succeeded")
+    assert (tmp_path / "runs" / "lr0.0005" / "results.json").is_file()

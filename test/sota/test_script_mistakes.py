@@ -75,6 +75,15 @@ def test_what_the_files_declare_may_be_changed(check, overrides):
     assert check("train", overrides) is None
 
 
+@pytest.mark.parametrize(("launcher", "extra"), [("processes", "sweep"), ("slurm", "slurm")])
+def test_a_launcher_without_its_package_is_refused(scripts, monkeypatch, launcher, extra):
+    cli = scripts("cli")
+    monkeypatch.setattr(cli, "_installed", lambda module: False)
+    assert cli.check_launcher(["seed=0,1", "hydra/launcher=basic"]) is None
+    with pytest.raises(ValueError, match=rf"pip install 'torchrl_ficreg\[{extra}\]'"):
+        cli.check_launcher(["seed=0,1", f"hydra/launcher={launcher}"])
+
+
 def refused(done, *words):
     assert done.returncode != 0
     lines = done.stderr.strip().splitlines()

@@ -1,0 +1,71 @@
+"""Claims about devices, where there is no GPU: a model on CUDA plans for environments on the CPU, and is trained there."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from pretend_cuda import CUDA, MixedDevices, PretendCuda, to_cuda
+from scenes import same_room_pairs
+
+from torchrl_ficreg import FICRegLoss, GoalPolicy, make_world_model, ModelConfig, MPCPolicy
+from torchrl_ficreg.evaluation import evaluate_mpc
+from torchrl_ficreg.modules.planners import common, SEARCHES
+
+SIZES = ModelConfig(
+    encoder="conv",
+    image_size=16,
+    frame_skip=2,
+    latent_dim=4,
+    history=2,
+    conv_channels=(4, 8),
+    predictor_depth=1,
+    predictor_width=16,
+    predictor_heads=2,
+    predictor_dim_head=8,
+)
+
+
+def test_the_pretended_device_refuses_what_cuda_refuses():
+    with PretendCuda():
+        here, there = torch.ones(2), torch.ones(2).to("cuda")
+        assert there.device == CUDA and (there * 2).device == CUDA and here.device.type == "cpu"
+        assert (there.cpu() + here).device.type == "cpu" and torch.zeros(2, device=CUDA).device == CUDA
+        for mixed in (lambda: here + there, lambda: there.numpy(), lambda: here[there.long()], lambda: torch.cat([here, there])):
+            with pytest.raises(MixedDevices):
+                mixed()
+
+
+@pytest.mark.parametrize("history", ["context", "one_frame"])
+@pytest.mark.parametrize("search", SEARCHES)
+def test_a_model_on_cuda_plans_for_environments_on_the_cpu(monkeypatch, search, history):
+    """Three plans of an episode, the later ones with a past and a plan to continue; the outcome is that of the CPU."""
+    torch.manual_seed(0)
+    model, _ = make_world_model(SIZES, action_dim=2)
+    policy = GoalPolicy(latent_dim=4, action_dim=4) if search == "policy" else None
+    kind = SEARCHES[search].config_class
+    settings = {"num_candidates": 8, "num_elites": 4, "iterations": 2, "horizon": 2, "receding_horizon": 1}
+    config = kind(**settings, history=history, precision="fp32")
+    planner = SEARCHES[search](model.eval(), config, action_bounds=([-1, -1], [1, 1]), policy=policy)
+
+    def outcome():
+        return evaluate_mpc(MPCPolicy(planner), same_room_pairs(3), budget=6, image_size=16, num_envs=2, progress_bar=False)
+
+    expected = outcome()
+    make = common.make_generator  # of a device that is not there none can be made
+    monkeypatch.setattr(common, "make_generator", lambda seed, environment, device: make(seed, environment, torch.device("cpu")))
+    with PretendCuda():
+        to_cuda(planner)
+        found = outcome()
+    assert torch.tensor(found.success).equal(torch.tensor(expected.success))
+
+
+def test_a_loss_on_cuda_computes_on_cuda():
+    model, inverse_model = make_world_model(SIZES, action_dim=2)
+    loss = FICRegLoss(model.encoder, model.predictor, inverse_model, diagnostics=True)
+    pixels = torch.randint(0, 256, (4, 3, 3, 16, 16), dtype=torch.uint8)
+    clip = {"pixels": pixels, "action": torch.randn(4, 3, 4), "mask": torch.ones(4, 3, dtype=torch.bool)}
+    with PretendCuda():
+        to_cuda(loss)
+        output = loss(**{name: value.to("cuda") for name, value in clip.items() if name != "mask"})
+        for value in output if isinstance(output, tuple) else output.values():
+            assert value.device == CUDA

@@ -14,9 +14,11 @@ after SIGTERM (exit code 85) or Ctrl-C (130) in training from the step it had re
 
 from __future__ import annotations
 
+import os
 import signal
 from pathlib import Path
 
+os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # huge pages for large tensors on CPUs: torch looks when it starts
 import torch
 from cli import entry_point
 from episodes import find_dataset, make_dataset

@@ -151,7 +151,7 @@ def single():
     return scenarios({"equal": slice(None), "unequal": slice(None)}, 1)
 
 
-@pytest.fixture(scope="module", params=[2, 4])
+@pytest.fixture(scope="module", params=[2, pytest.param(4, marks=pytest.mark.slow)])
 def ranks(request, tmp_path_factory):
     """What each of the processes makes of its part."""
     folder = str(tmp_path_factory.mktemp("ranks"))

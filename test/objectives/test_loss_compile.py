@@ -9,7 +9,7 @@ from loss_collection import COLLECTION, make_clip, make_loss
 from torch._dynamo.testing import CompileCounterWithBackend
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning:tensordict.*")
-QUICK = ("paper", "pldm")  # the others take ten seconds each
+QUICK = ("paper",)  # the others take ten seconds each
 
 
 def step(loss, function, clip):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from scenes import make_dataset, same_room_pairs
+from scenes import make_dataset, make_pairs, same_room_pairs
 
 from torchrl_ficreg.data import split_episodes
 from torchrl_ficreg.evaluation import StartGoalPairs
@@ -121,6 +122,16 @@ def test_what_is_no_manifest_is_refused_by_its_path(tmp_path, text):
     path.write_bytes(text.encode("utf-8", "surrogateescape"))
     with pytest.raises(ValueError, match="pairs.json is not a manifest"):
         StartGoalPairs.load(path)
+
+
+def test_runs_that_write_one_manifest_at_once_do_not_disturb_each_other(tmp_path):
+    """As the runs of a sweep do, whose draws are the same."""
+    pairs, path = make_pairs([[60, 60]] * 50, [[60, 140]] * 50), tmp_path / "pairs.json"
+    with ThreadPoolExecutor(8) as pool:
+        for done in [pool.submit(pairs.save, path) for _ in range(200)]:
+            done.result()
+    assert StartGoalPairs.load(path).hash == pairs.hash
+    assert [file.name for file in tmp_path.iterdir()] == ["pairs.json"]
 
 
 def test_frozen_pairs_are_drawn_once_and_read_ever_after(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import secrets
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,9 +102,9 @@ class StartGoalPairs:
         return pairs
 
     def save(self, path: Path) -> None:
-        """Writes the manifest in one piece."""
+        """Writes the manifest in one piece, also where several runs write the same one at once."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(path.name + ".part")
+        part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
         part.write_text(json.dumps({**self._content(), "hash": self.hash}, indent=1))
         os.replace(part, path)
 

@@ -162,10 +162,10 @@ def our_terms(loss: FICRegLoss, clip: TensorDictBase) -> Terms:
 
 def measure(names: tuple[str, ...], clips: int, repeats: int, rounds: int) -> tuple[dict, dict, dict]:
     """Of each way: its losses, and the least wall and processor seconds of a step."""
-    wall, cpu = (dict.fromkeys(names, math.inf) for _ in range(2))
+    losses, wall, cpu = {}, *(dict.fromkeys(names, math.inf) for _ in range(2))
     for _ in range(rounds):
         with ways(names, clips) as pipes:
-            losses = {name: ask(pipe, "compare") for name, pipe in pipes.items()}
+            losses = losses or {name: ask(pipe, "compare") for name, pipe in pipes.items()}  # the same in every round
             for repeat in range(-3, repeats):  # kernels choose their blocking at first, then allocators settle
                 for name, pipe in pipes.items():
                     spent, busy = ask(pipe, "step")

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
+from torchrl_ficreg.modules.collectives import num_processes
+
 # A rank may wait this long while another one records data or evaluates. A rank that has died is noticed by torchrun.
 PATIENCE = timedelta(hours=6)
 
@@ -22,7 +24,7 @@ def launched() -> bool:
 
 def together() -> bool:
     """Whether this process is one of several that have met."""
-    return dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
+    return num_processes() > 1
 
 
 def rank() -> int:
@@ -39,7 +41,7 @@ def rank() -> int:
 
 def world_size() -> int:
     """Number of processes that have met; 1 for a process on its own."""
-    return dist.get_world_size() if together() else 1
+    return num_processes()
 
 
 def is_main() -> bool:

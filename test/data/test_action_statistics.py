@@ -31,6 +31,16 @@ def test_a_constant_dimension_becomes_zero_and_comes_back():
     torch.testing.assert_close(statistics.denormalize(statistics.normalize(action)), action)
 
 
+def test_constant_dimensions_are_told_from_those_of_deviation_one():
+    """Also by what a checkpoint keeps of them, mean and std; statistics of ones were not measured at all."""
+    action = torch.tensor([[1.0, 7.0, 1.0], [3.0, 7.0, 5.0]])  # deviations 1, 0 and 2
+    measured = ActionStatistics.from_actions(action)
+    torch.testing.assert_close(measured.std, torch.tensor([1.0, 1.0, 2.0]))
+    for statistics in (measured, ActionStatistics(measured.mean, torch.tensor(measured.std.tolist()))):
+        assert statistics.constant.tolist() == [False, True, False]
+    assert ActionStatistics(torch.zeros(2), torch.ones(2)).constant.tolist() == [False, False]
+
+
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
 def test_a_block_is_its_actions_one_after_another(batch):
     statistics = ActionStatistics(torch.tensor([1.0, -2.0, 0.5]), torch.tensor([2.0, 0.5, 1.0]))

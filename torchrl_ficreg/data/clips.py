@@ -90,6 +90,8 @@ class ClipStorage(TensorStorage):
             raise ValueError(f"num_frames and frame_skip must be positive, got {num_frames} and {frame_skip}.")
         if not keys or not set(keys) <= set(CLIP_KEYS):
             raise KeyError(f"a clip holds some of {CLIP_KEYS}, got keys={tuple(keys)}.")
+        if STATE in keys:
+            store.require_state()
         self.store, self.statistics, self.keys = store, statistics, tuple(keys)
         self.num_frames, self.frame_skip = num_frames, frame_skip
         episodes = np.asarray(episodes, dtype=np.int64)
@@ -130,6 +132,7 @@ class ClipStorage(TensorStorage):
         """
         first, stop, episode = self._locate(index)  # each [B...]
         frame = first[..., None] + np.arange(self.num_frames) * self.frame_skip  # [B..., T]
+        self.store.check_files()
         clip: dict[str, Any] = {}
         for key in self.keys:
             if key == ACTION:

@@ -213,6 +213,14 @@ class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
         """A, the size of one raw action."""
         return self._statistics.action_dim
 
+    def require_state(self) -> None:
+        """Refuses a dataset without states, for what needs them; see :meth:`EpisodeStore.require_state`.
+
+        Raises:
+            ValueError: the episodes were converted without a state.
+        """
+        self._store.require_state()
+
     def row(self, episode: int, step: int) -> int:
         """The row of a step of an episode of this split.
 
@@ -242,6 +250,7 @@ class OfflineTrajectories(SeekableReplayBuffer, BaseDatasetExperienceReplay):
             KeyError: the split has no such episode.
         """
         rows = self._rows(episode)
+        self._store.check_files()
         step = torch.arange(rows.stop - rows.start)[steps]
         rows = slice(*(rows.start + bound for bound in steps.indices(rows.stop - rows.start)[:2]), steps.step)
         read = {key: self._store.frames if key == PIXELS else self._store.arrays[key].__getitem__ for key in keys}
@@ -297,4 +306,7 @@ def _measure(store: EpisodeStore, episodes: np.ndarray) -> ActionStatistics:
     if not rows:
         raise ValueError("the training split is empty, so it has no action statistics: record more, or pass them.")
     action = np.concatenate([store.arrays[ACTION][span.start : span.stop - 1] for span in rows])  # [N, A]
-    return ActionStatistics.from_actions(torch.from_numpy(action))
+    try:
+        return ActionStatistics.from_actions(torch.from_numpy(action))
+    except ValueError as error:
+        raise ValueError(f"{store.path or 'the dataset in memory'}: {error}") from error

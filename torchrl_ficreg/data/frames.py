@@ -152,6 +152,10 @@ class ImageFrames:
     Keyword Args:
         num_threads: images decoded at a time: Pillow decodes without holding the interpreter. Default: the usable
             cores, at most eight. The result does not depend on it.
+        where: the dataset they belong to, for errors.
+
+    Raises:
+        ValueError: the first image has another size than ``shape``, or is damaged.
 
     Examples:
         >>> pixels = np.random.default_rng(0).integers(0, 256, (4, 3, 8, 8), dtype=np.uint8)
@@ -170,6 +174,7 @@ class ImageFrames:
         frames: FrameFormat,
         *,
         num_threads: int | None = None,
+        where: str = "",
     ) -> None:
         check_frame_format(frames)
         self._blob = memoryview(blob)
@@ -178,9 +183,24 @@ class ImageFrames:
         self._decode = _decoder(frames, shape)
         self._num_threads = num_threads or default_threads()
         self._recycler = Recycler()
+        self._where = f"{where}: " if where else ""
+        if len(ends):  # before memory for frames of this shape is asked for
+            self._decode_row(0, None)
 
     def __len__(self) -> int:
         return len(self._ends)
+
+    def _decode_row(self, row: int, frame: np.ndarray | None) -> None:
+        from PIL import Image
+
+        begin = self._ends[row - 1] if row else 0
+        try:
+            self._decode(self._blob[begin : self._ends[row]], frame)
+        # All of them come out of Pillow.
+        except (ValueError, OSError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+            raise ValueError(
+                f"{self._where}the image of row {row} is damaged ({error}): restore the files or collect again."
+            ) from error
 
     def read(self, rows: slice | np.ndarray) -> np.ndarray:
         """Decodes frames to a fresh uint8 [..., 3, H, W].
@@ -195,13 +215,7 @@ class ImageFrames:
 
         def work(start: int, stop: int) -> None:
             for row, frame in zip(flat[start:stop].tolist(), out[start:stop]):
-                begin = self._ends[row - 1] if row else 0
-                try:
-                    self._decode(self._blob[begin : self._ends[row]], frame)
-                except (ValueError, OSError, SyntaxError, EOFError) as error:  # all of them come out of Pillow
-                    raise ValueError(
-                        f"the image of row {row} is damaged ({error}): restore the files or collect again."
-                    ) from error
+                self._decode_row(row, frame)
 
         run_split(work, len(flat), num_threads=self._num_threads)
         return out.reshape(*np.shape(rows), *self._shape)
@@ -223,18 +237,20 @@ def _flat_rows(rows: np.ndarray, count: int) -> np.ndarray:
     return flat
 
 
-def _decoder(frames: FrameFormat, shape: tuple[int, ...]) -> Callable[[memoryview, np.ndarray], None]:
-    """A function that decodes one image into a frame [3, H, W]."""
+def _decoder(frames: FrameFormat, shape: tuple[int, ...]) -> Callable[[memoryview, np.ndarray | None], None]:
+    """A function that decodes one image into a frame [3, H, W]; without a frame it looks at the size alone."""
     from PIL import Image
 
     _, height, width = shape
     formats = [_SAVE_OPTIONS[frames]["format"]]
 
-    def decode(data: memoryview, frame: np.ndarray) -> None:
+    def decode(data: memoryview, frame: np.ndarray | None) -> None:
         with Image.open(io.BytesIO(data), formats=formats) as image:
             if image.mode != "RGB" or image.size != (width, height):
                 got = f"{image.mode} {image.size[1]} x {image.size[0]}"
                 raise ValueError(f"it is {got}, expected RGB {height} x {width}")
+            if frame is None:
+                return
             # Channel by channel: Pillow is twice as fast at pulling one out as numpy at transposing the picture.
             for channel, name in zip(frame, "RGB"):
                 channel[...] = np.frombuffer(image.tobytes("raw", name), np.uint8).reshape(height, width)

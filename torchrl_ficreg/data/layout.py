@@ -21,6 +21,7 @@ ignore both, a writer cuts them off. Everything else that does not fit is damage
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import zlib
@@ -31,12 +32,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchrl_ficreg._utils import MOST_JSON_BYTES, read_bytes, require_regular_file, write_atomic
 from torchrl_ficreg.data.frames import frame_bytes, FRAME_FORMATS, FrameFormat
 from torchrl_ficreg.data.schema import ACTION, PIXELS, STATE
 
 FORMAT = "torchrl_ficreg.episodes"
 # Version 2 has compressed frames. Raw datasets stay at version 1: code that knows nothing else reads them as before.
 VERSIONS = (1, 2)
+_MOST = 2**40  # above any number of rows, episodes or bytes of a row; products of two fit into 63 or 64 bits
 META_FILE = "meta.json"
 INDEX_FILE = "episodes.jsonl"
 DTYPES = {PIXELS: np.dtype("<u1"), ACTION: np.dtype("<f4"), STATE: np.dtype("<f8")}
@@ -96,29 +99,71 @@ class Header:
         return json.dumps(content, indent=2, sort_keys=True) + "\n"
 
     @classmethod
-    def from_json(cls, text: str, where: str | Path) -> Header:
+    def from_json(cls, text: str | bytes, where: str | Path) -> Header:
         """Reads ``meta.json``; ``where`` names it in errors.
 
         Raises:
-            ValueError: no JSON, not this format, another version, or a missing field.
+            ValueError: no JSON, not this format, another version, or a field that is missing or cannot be.
         """
         try:
-            content = json.loads(text)
+            content = json.loads(text if isinstance(text, str) else text.decode("utf-8"))
             if content["format"] != FORMAT:
                 raise KeyError(FORMAT)
             version = content["version"]
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(f"{where} is not the header of a {FORMAT} dataset: collect or copy it again.") from error
-        if version not in VERSIONS:
+        if not _is_count(version) or version not in VERSIONS:
             raise ValueError(f"{where} has format version {version!r}, this code reads 1 and 2: collect it again.")
-        try:
-            shapes = {key: tuple(content["shapes"][key]) for key in DTYPES}
-            frames = content.get("frames", "raw")  # absent from the first datasets
-            if frames not in FRAME_FORMATS:
-                raise ValueError(f"'frames', {frames!r}")
-            return cls(int(content["target_episodes"]), shapes, dict(content["meta"]), frames)
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{where} lacks or garbles the field {error}: collect or copy it again.") from error
+        frames = content.get("frames", "raw")  # absent from the first datasets
+        shapes, target = content.get("shapes"), content.get("target_episodes")
+        checks = {
+            "frames": isinstance(frames, str) and frames in FRAME_FORMATS and (version == 1) == (frames == "raw"),
+            "shapes": isinstance(shapes, dict) and all(_is_shape(key, shapes.get(key)) for key in DTYPES),
+            "dtypes": content.get("dtypes") == {key: dtype.str for key, dtype in DTYPES.items()},
+            "target_episodes": _is_count(target),
+            "meta": isinstance(content.get("meta"), dict),
+        }
+        for name, good in checks.items():
+            if not good:
+                got = repr(content[name])[:120] if name in content else "nothing"
+                raise ValueError(f"{where} lacks or garbles the field {name!r}, {got}: collect or copy it again.")
+        return cls(target, {key: tuple(shapes[key]) for key in DTYPES}, content["meta"], frames)
+
+
+def read_header(path: Path) -> Header:
+    """The header of the dataset in a folder.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: see :meth:`Header.from_json`.
+    """
+    return Header.from_json(read_bytes(path / META_FILE, most=MOST_JSON_BYTES), path / META_FILE)
+
+
+def read_index(path: Path, header: Header) -> tuple[list[IndexEntry], int]:
+    """As :func:`parse_index` of the dataset in a folder, whose header has been read.
+
+    Raises:
+        ValueError: the index is damaged, or holds more episodes than the header's target.
+    """
+    entries, committed = parse_index(read_bytes(path / INDEX_FILE), path / INDEX_FILE)
+    if len(entries) > header.target_episodes:
+        raise ValueError(
+            f"{path / INDEX_FILE} holds {len(entries)} episodes, {META_FILE} a target of {header.target_episodes}: one "
+            "of the two is damaged, restore it."
+        )
+    return entries, committed
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value < _MOST
+
+
+def _is_shape(key: str, shape: Any) -> bool:
+    """Whether rows of ``key`` may have this shape: [3, H, W] pixels, [A] actions, [S] states."""
+    if not isinstance(shape, list) or not all(_is_count(size) for size in shape) or prod(shape) >= _MOST:
+        return False
+    return len(shape) == 3 and shape[0] == 3 if key == PIXELS else len(shape) == 1
 
 
 class IndexEntry(NamedTuple):
@@ -172,11 +217,12 @@ def parse_index(content: bytes, where: str | Path) -> tuple[list[IndexEntry], in
     for number, line in enumerate(content[:committed].splitlines(), start=1):
         try:
             entry = IndexEntry(**json.loads(line))
-            whole = all(isinstance(value, int) for value in entry)
-        except (ValueError, TypeError) as error:
+            whole = all(isinstance(value, int) and not isinstance(value, bool) for value in entry)
+        except (ValueError, TypeError, RecursionError) as error:
             raise ValueError(f"{where}, line {number} is garbled: restore the file or collect again.") from error
         expected = (number, entries[-1].stop if entries else 0)
-        if not whole or (entry.episode, entry.start) != expected or entry.length < 1:
+        whole = whole and all(0 <= crc < 2**32 for crc in (entry.crc, entry.pixels_crc))
+        if not whole or (entry.episode, entry.start) != expected or not 1 <= entry.length < _MOST - entry.start:
             got = f"episode {entry.episode} at row {entry.start} with {entry.length} rows"
             want = f"episode {expected[0]} at row {expected[1]}"
             raise ValueError(f"{where}, line {number} holds {got}, expected {want}: restore it or collect again.")
@@ -232,8 +278,9 @@ def read_offsets(path: Path, num_steps: int) -> np.ndarray:
 
 
 def _check_size(file: Path, need: int) -> None:
-    size = file.stat().st_size if file.exists() else 0
-    if size < need or not file.exists():
+    exists = file.exists()
+    size = require_regular_file(file).st_size if exists else 0
+    if size < need or not exists:
         raise ValueError(f"{file} is damaged: {size} bytes, the index needs {need}: restore it or collect again.")
 
 
@@ -267,28 +314,19 @@ def estimate_bytes(
 
 def write_header(path: Path, header: Header) -> None:
     """Writes ``meta.json`` so that a crash leaves the old file or the new one, never a half."""
-    temporary = path / f"{META_FILE}.tmp"
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
-    try:
-        write_all(descriptor, header.to_json().encode())
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-    os.replace(temporary, path / META_FILE)
+    write_atomic(path / META_FILE, header.to_json())
     sync_directory(path)
-
-
-def write_all(descriptor: int, data: Any) -> None:
-    """Writes a whole buffer: one ``write`` may stop short of it (2 GiB on Linux)."""
-    view = memoryview(data).cast("B")
-    while view:
-        view = view[os.write(descriptor, view) :]
 
 
 def sync_directory(path: Path) -> None:
     """Makes the names in a directory durable, as ``fsync`` of a file does for its bytes."""
+    if os.name == "nt":  # folders cannot be opened there
+        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:  # CIFS, FUSE and others do not know how
+        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS):
+            raise
     finally:
         os.close(descriptor)

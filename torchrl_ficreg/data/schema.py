@@ -28,8 +28,8 @@ def check_episode(episode: dict[str, np.ndarray]) -> int:
     """Checks one recorded episode against the key contract.
 
     Args:
-        episode: arrays ``pixels`` [L, 3, H, W] uint8, ``action`` [L, A] float32 and ``state`` [L, S] float64,
-            where row t holds the frame, the action that leads from it, and the state it was drawn from.
+        episode: arrays ``pixels`` [L, 3, H, W] uint8, ``action`` [L, A] float32 and ``state`` [L, S] float64
+            (S = 0 where there is none), where row t holds the frame, the action that leads from it, and the state it was drawn from.
 
     Returns:
         L, the number of steps.
@@ -54,7 +54,7 @@ def check_episode(episode: dict[str, np.ndarray]) -> int:
         if value.ndim != ndim or value.dtype != dtype:
             want = f"{ndim}-d {np.dtype(dtype).name}"
             raise ValueError(f"{key!r} must be {want}, got {value.ndim}-d {value.dtype}: convert it before writing.")
-        if not value.size:
+        if not value.size and (key != STATE or value.shape[1:] != (0,)):  # data without a simulator have no state
             raise ValueError(f"{key!r} must hold at least one number per step, got shape {value.shape}.")
         if key != PIXELS and not np.isfinite(value).all():
             raise ValueError(f"{key!r} holds a NaN or an infinity: drop those steps before writing.")

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_ficreg.data.layout import Header, INDEX_FILE, META_FILE, parse_index
+from torchrl_ficreg.data.layout import Header, IndexEntry, META_FILE, read_header, read_index
 from torchrl_ficreg.data.schema import PIXELS
 from torchrl_ficreg.data.store import EpisodeStore, Verify
 
@@ -64,9 +64,18 @@ def open_store(
 
 
 def shard_paths(folder: Path) -> list[Path]:
-    """The shards of a directory, by number: those that have begun."""
+    """The shards of a directory, by number: those that have begun.
+
+    Raises:
+        ValueError: two have the same number, such as ``shard-0`` and ``shard-00``.
+    """
     found = [path.parent for path in folder.glob(f"{SHARD.format('*')}/{META_FILE}")]
-    numbered = {int(path.name.rpartition("-")[2]): path for path in found if re.fullmatch(r"shard-[0-9]+", path.name)}
+    found = sorted(path for path in found if re.fullmatch(r"shard-[0-9]+", path.name))
+    numbered = {int(path.name.rpartition("-")[2]): path for path in found}
+    if len(numbered) < len(found):
+        first = next(path for path in found if path not in numbered.values())
+        twin = numbered[int(first.name.rpartition("-")[2])].name
+        raise ValueError(f"{folder} holds {first.name} and {twin}, two shards of one number: move one of them away.")
     return [path for _, path in sorted(numbered.items())]
 
 
@@ -78,7 +87,7 @@ def shard_meta(folder: Path) -> dict[str, Any] | None:
     """
     for path in shard_paths(folder):
         file = path / META_FILE
-        meta = Header.from_json(file.read_text(), file).meta
+        meta = read_header(path).meta
         if NUM_SHARDS not in meta:
             raise ValueError(f"{file} does not say how many shards exist: give dataset={folder} or another data_dir.")
         return meta
@@ -153,6 +162,11 @@ class ShardedStore(EpisodeStore):
         """Position, from 0, of the episode that holds each row."""
         return np.searchsorted(self.start, rows, side="right") - 1
 
+    def check_files(self) -> None:
+        """As :meth:`EpisodeStore.check_files`, of every shard."""
+        for shard in self.shards:
+            shard.check_files()
+
     def _open_data(self) -> None:
         keys = [key for key in self.header.mapped if key != PIXELS]
         self.arrays = {key: np.concatenate([self._rows_of(e)[key] for e in range(self.num_episodes)]) for key in keys}
@@ -181,6 +195,6 @@ def _refuse_twice(names: Sequence[object], advice: str) -> None:
         raise ValueError(f"{', '.join(twice)} would be opened twice: {advice}.")
 
 
-def _index(shard: EpisodeStore) -> list:
+def _index(shard: EpisodeStore) -> list[IndexEntry]:
     """The index of a shard; its checksums are not among what a store keeps."""
-    return parse_index((shard.path / INDEX_FILE).read_bytes(), shard.path / INDEX_FILE)[0][: shard.num_episodes]
+    return read_index(shard.path, shard.header)[0][: shard.num_episodes]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-_RESERVE = 256 * 2**20  # bytes left alone: logs, checkpoints, the rest of the system
+_RESERVE = 256 * 2**20  # most bytes left alone: logs, checkpoints, the rest of the system
+_RESERVED_PART = 0.02  # and no more than this part of a small disk
 
 
 def require_space(path: str | Path, num_bytes: int) -> None:
@@ -16,7 +17,7 @@ def require_space(path: str | Path, num_bytes: int) -> None:
         num_bytes: how many.
 
     Raises:
-        OSError: there is less free space than that and a reserve of 256 MiB.
+        OSError: there is less free space than that and a reserve: 256 MiB, or 2 % of a disk smaller than 13 GB.
 
     Examples:
         >>> require_space("somewhere/new", 1)
@@ -24,9 +25,10 @@ def require_space(path: str | Path, num_bytes: int) -> None:
     place = Path(path).expanduser().absolute()
     while not place.exists():
         place = place.parent
-    free = shutil.disk_usage(place).free
-    if num_bytes + _RESERVE > free:
+    total, _, free = shutil.disk_usage(place)
+    reserve = min(_RESERVE, int(total * _RESERVED_PART))
+    if num_bytes + reserve > free:
         raise OSError(
-            f"{path} needs {num_bytes / 1e9:.2f} GB and {place} has {free / 1e9:.2f} GB free: record fewer episodes or "
-            "smaller frames, or write to another disk."
+            f"{path} needs {num_bytes / 1e6:.1f} MB and a reserve of {reserve / 1e6:.1f} MB, {place} has "
+            f"{free / 1e6:.1f} MB free: record fewer episodes or smaller frames, or write to another disk."
         )

@@ -29,10 +29,10 @@ class ActionStatistics:
         ValueError: ``mean`` and ``std`` are not two equal [A] vectors, finite, with positive ``std``.
 
     Examples:
-        >>> action = torch.tensor([[1.0, 7.0], [3.0, 7.0]])
+        >>> action = torch.tensor([[1.0, 7.0], [5.0, 7.0]])
         >>> statistics = ActionStatistics.from_actions(action)
-        >>> statistics.mean, statistics.std
-        (tensor([2., 7.]), tensor([1., 1.]))
+        >>> statistics.mean, statistics.std, statistics.constant
+        (tensor([3., 7.]), tensor([2., 1.]), tensor([False,  True]))
         >>> statistics.normalize(action)
         tensor([[-1.,  0.],
                 [ 1.,  0.]])
@@ -66,13 +66,25 @@ class ActionStatistics:
         if not action.isfinite().all():
             raise ValueError("action holds a NaN or an infinity: leave out the rows at which no action was taken.")
         std, mean = torch.std_mean(action, dim=0, correction=0)  # [A], [A]
-        std = torch.where(std < _SMALLEST_STD, torch.ones_like(std), std)
-        return cls(mean.float(), std.float())
+        constant, std = std < _SMALLEST_STD, std.float()
+        # Exactly 1 is kept for constant dimensions: a measured 1 becomes the next float above it.
+        std = torch.where(std == 1, torch.nextafter(std, std + 1), std)
+        return cls(mean.float(), torch.where(constant, torch.ones_like(std), std))
 
     @property
     def action_dim(self) -> int:
         """A."""
         return len(self.mean)
+
+    @property
+    def constant(self) -> Tensor:
+        """Which dimensions never change in the data, bool [A]: a plan keeps them at their mean.
+
+        They are those of std exactly 1. Where every std is 1 the statistics leave the units alone and were not
+        measured: then no dimension counts as constant.
+        """
+        ones = self.std == 1  # [A]
+        return ones & ~ones.all()
 
     def normalize(self, action: Tensor) -> Tensor:
         """Environment units to z-scores, ``(action - mean) / std``; [..., A] or [..., F * A], same shape out."""

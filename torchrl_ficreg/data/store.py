@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from torchrl_ficreg._utils import NO_WAIT
 from torchrl_ficreg.data.frames import ImageFrames, RawFrames
 from torchrl_ficreg.data.layout import (
     BLOB,
@@ -24,10 +25,11 @@ from torchrl_ficreg.data.layout import (
     INDEX_FILE,
     IndexEntry,
     META_FILE,
-    parse_index,
+    read_header,
+    read_index,
     read_offsets,
 )
-from torchrl_ficreg.data.schema import check_episode, PIXELS
+from torchrl_ficreg.data.schema import ACTION, check_episode, PIXELS, STATE
 
 Verify = Literal["ends", "full", "none"]
 
@@ -63,6 +65,7 @@ class EpisodeStore:
         start: int64 [E], first row of each episode; episode ``e`` is entry ``e - 1``.
         length: int64 [E], rows of each episode.
         arrays: key -> [N, ...] rows; ``pixels`` is among them only when the frames are raw.
+        blob_bytes: of compressed frames, what their images take together.
         fingerprint: sha256 of the index, and through its checksums of the data; the same for every frame format.
     """
 
@@ -101,6 +104,18 @@ class EpisodeStore:
         start = int(self.start[episode - 1])
         return slice(start, start + int(self.length[episode - 1]))
 
+    def require_state(self) -> None:
+        """Refuses data without a state, for what needs one.
+
+        Raises:
+            ValueError: the episodes were converted without a state.
+        """
+        if not self.header.row_bytes(STATE):
+            raise ValueError(
+                f"{self.path or 'the dataset'} holds no state: training needs none, but start-goal pairs, distances and "
+                "clips with the key 'state' do; convert it again with state= naming the columns."
+            )
+
     def frames(self, rows: slice | np.ndarray) -> np.ndarray:
         """Reads frames.
 
@@ -136,12 +151,12 @@ class EpisodeStore:
         """
         if verify not in ("ends", "full", "none"):
             raise ValueError(f"verify must be 'ends', 'full' or 'none', got {verify!r}.")
-        if not (path / META_FILE).is_file():
+        if not (path / META_FILE).exists():
             raise FileNotFoundError(f"no dataset at {path}: {COLLECT_HINT.format(env='<env>')}, or correct the path.")
-        header = Header.from_json((path / META_FILE).read_text(), path / META_FILE)
-        if not (path / INDEX_FILE).is_file():
+        header = read_header(path)
+        if not (path / INDEX_FILE).exists():
             raise ValueError(f"{path} is damaged: {INDEX_FILE} is missing: restore it or collect again.")
-        entries, _ = parse_index((path / INDEX_FILE).read_bytes(), path / INDEX_FILE)
+        entries, _ = read_index(path, header)
         if not entries or (len(entries) < header.target_episodes and not allow_incomplete):
             hint = COLLECT_HINT.format(env=header.meta.get("env", "<env>"))
             escape = ", or pass allow_incomplete=True" if entries else ""
@@ -150,7 +165,7 @@ class EpisodeStore:
         store = cls(header, entries, None, path, num_threads=num_threads)
         checked = {"ends": {entries[0], entries[-1]}, "full": entries, "none": ()}[verify]
         for entry in checked:
-            store._check(entry)
+            store.check_episode(entry)
         return store
 
     @classmethod
@@ -190,17 +205,43 @@ class EpisodeStore:
     def _open_data(self) -> None:
         options = {"num_threads": self.num_threads}
         header, num_steps = self.header, self.num_steps
+        self._sizes: dict[Path, int] = {}
         if self.path is not None and self.arrays is None:
             check_sizes(self.path, header, num_steps)
             self.arrays = {key: _map_rows(self.path, header, num_steps, key) for key in header.mapped}
+            self._sizes = {data_file(self.path, key): num_steps * header.row_bytes(key) for key in header.mapped}
         if header.frames == "raw":
             self._frames: RawFrames | ImageFrames = RawFrames(self.arrays[PIXELS], **options)
         else:
             ends = read_offsets(self.path, num_steps)
             blob = _map_file(self.path / BLOB, int(ends[-1]))
-            self._frames = ImageFrames(blob, ends, header.shapes[PIXELS], header.frames, **options)
+            self.blob_bytes = self._sizes[self.path / BLOB] = int(ends[-1])
+            self._frames = ImageFrames(
+                blob, ends, header.shapes[PIXELS], header.frames, where=str(self.path), **options
+            )
 
-    def _check(self, entry: IndexEntry) -> None:
+    def check_files(self) -> None:
+        """Checks that no mapped file has become shorter: reading beyond its end would end the process by SIGBUS.
+
+        Costs some microseconds a file. A file that was removed stays readable through its mapping.
+
+        Raises:
+            OSError: a file has become shorter.
+        """
+        for file, need in self._sizes.items():
+            try:
+                size = os.stat(file).st_size
+            except FileNotFoundError:
+                continue
+            if size < need:
+                raise OSError(f"{file} has shrunk from {need} to {size} bytes: restore it and open the dataset again.")
+
+    def check_episode(self, entry: IndexEntry) -> None:
+        """Compares the checksums of one episode, and checks that its numbers are finite.
+
+        Raises:
+            ValueError: they differ, or an action or state is not finite.
+        """
         rows = slice(entry.start, entry.stop)
         episode = {**{key: array[rows] for key, array in self.arrays.items()}, PIXELS: self.frames(rows)}
         if checksums(episode) != (entry.crc, entry.pixels_crc):
@@ -208,17 +249,24 @@ class EpisodeStore:
                 f"{self.path} is damaged: the bytes of episode {entry.episode} do not match their checksum: "
                 "restore the files or collect again."
             )
+        for key in (ACTION, STATE):
+            if not np.isfinite(episode[key]).all():
+                raise ValueError(
+                    f"{self.path} holds a NaN or an infinity in {key!r} of episode {entry.episode}: collect it again."
+                )
 
 
 def _map_rows(path: Path, header: Header, num_steps: int, key: str) -> np.ndarray:
     """Maps the first ``num_steps`` rows of a key."""
+    if not header.row_bytes(key):  # an empty state: nothing can be mapped
+        return np.empty((num_steps, *header.shapes[key]), DTYPES[key])
     mapped = _map_file(data_file(path, key), num_steps * header.row_bytes(key))
     return np.frombuffer(mapped, DTYPES[key]).reshape(num_steps, *header.shapes[key])
 
 
 def _map_file(file: Path, size: int) -> mmap.mmap:
     """Maps the first ``size`` bytes of a file, copy-on-write."""
-    descriptor = os.open(file, os.O_RDONLY)
+    descriptor = os.open(file, os.O_RDONLY | NO_WAIT)
     try:
         flags, protection = mmap.MAP_PRIVATE | _MAP_NORESERVE, mmap.PROT_READ | mmap.PROT_WRITE
         return mmap.mmap(descriptor, size, flags=flags, prot=protection)

@@ -11,7 +11,8 @@ MOST_THREADS = 8  # more readers than this only take cores from the training ste
 _pools: dict[int, ThreadPoolExecutor] = {}
 
 # A forked child has the pools but not their threads, and would wait for them for ever.
-os.register_at_fork(after_in_child=_pools.clear)
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
+    os.register_at_fork(after_in_child=_pools.clear)
 
 
 def default_threads() -> int:

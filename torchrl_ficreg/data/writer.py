@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from collections.abc import Mapping
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_ficreg._utils import lock_file, NO_FOLLOW, read_bytes, require_regular_file, write_all
 from torchrl_ficreg.data.frames import check_frame_format, encode_frames, FrameFormat
 from torchrl_ficreg.data.layout import (
     BLOB,
@@ -23,13 +23,13 @@ from torchrl_ficreg.data.layout import (
     META_FILE,
     OFFSET_DTYPE,
     OFFSETS,
-    parse_index,
-    read_offsets,
+    read_header,
+    read_index,
     sync_directory,
-    write_all,
     write_header,
 )
 from torchrl_ficreg.data.schema import check_episode, PIXELS
+from torchrl_ficreg.data.store import EpisodeStore
 
 
 class EpisodeWriter:
@@ -37,11 +37,14 @@ class EpisodeWriter:
 
     An episode is *committed* by its index line, which is written only after its rows are on disk::
 
-        rows -> pixels, action, state files -> fsync -> index line -> fsync
+        index line without its end -> rows -> pixels, action, state files -> fsync -> end of the line -> fsync
 
     A crash therefore loses at most the episode being appended. Opening the directory again cuts every file
     back to the last committed episode, and :attr:`num_episodes` says where to continue: a collection that
     derives episode k from ``(seed, k)`` can simply be run again and never repeats or skips one.
+
+    Nothing is cut before the checksums of committed episodes were compared, and never more than one unfinished
+    episode. A complete dataset is not opened for writing at all, so it may lie on a read-only file system.
 
     Args:
         path: directory of the dataset, created when missing.
@@ -61,7 +64,8 @@ class EpisodeWriter:
         ImportError: ``frames`` needs Pillow.
         RuntimeError: another writer has the dataset open.
         TypeError: ``meta`` holds something JSON cannot.
-        ValueError: the dataset was begun with another ``meta``, other ``frames`` or a larger target, or is damaged.
+        ValueError: the dataset was begun with another ``meta``, other ``frames`` or a larger target, or is damaged;
+            its files are left as they are.
 
     Examples:
         >>> import tempfile, numpy as np
@@ -109,14 +113,21 @@ class EpisodeWriter:
         self._files: dict[str, int] = {}
         if not resume and (self.path / META_FILE).exists():
             raise FileExistsError(f"{self.path} already holds a dataset: pass resume=True, or another directory.")
+        self._index = -1
         if (self.path / META_FILE).exists():  # looked for before anything is created, let alone cut
-            lost = [name for name in (INDEX_FILE, *self._read_header().files) if not (self.path / name).exists()]
-            if lost:
-                raise ValueError(f"{self.path} has lost {', '.join(lost)}: restore it, or use another directory.")
+            header, entries = self._read()
+            if len(entries) >= self.target_episodes == header.target_episodes:
+                check_sizes(self.path, header, self.num_steps)
+                return
         self.path.mkdir(parents=True, exist_ok=True)
-        self._index = os.open(self.path / INDEX_FILE, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+        self._index = self._open(INDEX_FILE)
         try:
-            self._lock(wait)
+            try:
+                lock_file(self._index, self.path, wait=wait)
+            except BlockingIOError as error:
+                raise RuntimeError(f"another writer has {self.path} open: wait for it or use another path.") from error
+            for part in self.path.glob(f"{META_FILE}.*.part"):  # of a writer that was killed
+                part.unlink()
             if (self.path / META_FILE).exists():
                 self._resume()
             elif os.fstat(self._index).st_size:
@@ -144,10 +155,10 @@ class EpisodeWriter:
             OSError: the disk is full or fails. The dataset still holds every episode committed before.
             RuntimeError: the writer is closed, or the target has been reached.
         """
-        if self._index < 0:
-            raise RuntimeError(f"the writer of {self.path} is closed: open a new one to continue.")
         if self.complete:
             raise RuntimeError(f"{self.path} holds its {self.target_episodes} episodes: open it with a larger target.")
+        if self._index < 0:
+            raise RuntimeError(f"the writer of {self.path} is closed: open a new one to continue.")
         length = check_episode(episode)
         shapes = {key: tuple(episode[key].shape[1:]) for key in DTYPES}
         if self._header is None:
@@ -157,16 +168,24 @@ class EpisodeWriter:
         entry = IndexEntry(self.num_episodes + 1, self.num_steps, length, *checksums(episode))
         line, (content, blob_bytes) = entry.to_line(), self._to_files(episode)
         try:
+            write_all(self._index, line.removesuffix(b"\n"))  # tells the next opening how much a crash may leave behind
             for name, rows in content.items():
                 write_all(self._files[name], rows)
             for descriptor in self._files.values():
                 os.fsync(descriptor)
-            write_all(self._index, line)
+            write_all(self._index, b"\n")
             os.fsync(self._index)
-        except BaseException:
+        except BaseException as error:
             # Cutting files back needs no space, so this also holds on a full disk. If even that fails, the
             # next opening does it.
             self._truncate()
+            if isinstance(error, OSError) and error.filename is None:
+                raise OSError(
+                    error.errno,
+                    f"{error.strerror}: episode {entry.episode} cannot be written, those before it are whole; make room and "
+                    "run the same command again",
+                    str(self.path),
+                ) from error
             raise
         self.num_episodes, self.num_steps = entry.episode, entry.stop
         self._index_bytes += len(line)
@@ -197,13 +216,6 @@ class EpisodeWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _lock(self, wait: bool) -> None:
-        # The lock belongs to the open file, so the kernel drops it when the process dies, however it dies.
-        try:
-            fcntl.flock(self._index, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError as error:
-            raise RuntimeError(f"another writer has {self.path} open: wait for it or use another path.") from error
-
     def _to_files(self, episode: dict[str, np.ndarray]) -> tuple[dict[str, Any], int]:
         """What to append to each data file, and how long the file of images is then."""
         content: dict[str, Any] = {
@@ -225,25 +237,60 @@ class EpisodeWriter:
         write_header(self.path, header)
         self._header = header
 
-    def _read_header(self) -> Header:
-        return Header.from_json((self.path / META_FILE).read_text(), self.path / META_FILE)
-
-    def _resume(self) -> None:
-        header = self._read_header()
+    def _read(self) -> tuple[Header, list[IndexEntry]]:
+        """Header and index of what is there, compared with what is wanted; nothing is opened for writing."""
+        header = read_header(self.path)
+        lost = [name for name in (INDEX_FILE, *header.files) if not os.path.lexists(self.path / name)]
+        if lost:
+            raise ValueError(f"{self.path} has lost {', '.join(lost)}: restore it, or use another directory.")
         self._check_meta(header)
-        index_file = self.path / INDEX_FILE
-        entries, self._index_bytes = parse_index(index_file.read_bytes(), index_file)
+        entries, self._index_bytes = read_index(self.path, header)
         if entries:
             self.num_episodes, self.num_steps = entries[-1].episode, entries[-1].stop
-        check_sizes(self.path, header, self.num_steps)
-        if header.frames != "raw" and self.num_steps:
-            self._blob_bytes = int(read_offsets(self.path, self.num_steps)[-1])
-        self._open_data(header)
+        return header, entries
+
+    def _resume(self) -> None:
+        header, entries = self._read()  # once more, now that nobody else writes
+        if entries:
+            store = EpisodeStore(header, entries, None, self.path, num_threads=self.num_threads)
+            for entry in {entries[0], entries[-1]}:
+                store.check_episode(entry)
+            if header.frames != "raw":
+                self._blob_bytes = store.blob_bytes
         self._header = header
+        self._check_excess(entries)
+        self._open_data(header)
         self._truncate()
         if self.target_episodes != header.target_episodes:
             self._header = header.with_target(self.target_episodes)
             write_header(self.path, self._header)
+
+    def _check_excess(self, entries: list[IndexEntry]) -> None:
+        """Refuses to cut off more than one unfinished episode: then header or index, not the data, are damaged.
+
+        Raises:
+            ValueError: there is more behind the last committed episode.
+        """
+        most = self._unfinished_rows(entries)
+        image = self._header.row_bytes(PIXELS) + 1024  # lossless images are hardly larger than what they hold
+        for name, committed in self._sizes().items():
+            row = {BLOB: image, OFFSETS: OFFSET_DTYPE.itemsize}.get(name) or self._header.row_bytes(name.split(".")[0])
+            excess = (self.path / name).stat().st_size - committed
+            if excess > most * row:
+                raise ValueError(
+                    f"{self.path / name} holds {excess} bytes that no committed episode owns, more than one unfinished "
+                    f"episode: {META_FILE} or {INDEX_FILE} is damaged. Nothing was changed: restore them."
+                )
+
+    def _unfinished_rows(self, entries: list[IndexEntry]) -> int:
+        """The most rows that one unfinished episode can have left behind."""
+        begun = read_bytes(self.path / INDEX_FILE)[self._index_bytes :]
+        try:
+            return int(json.loads(begun)["length"])
+        except (ValueError, TypeError, KeyError, RecursionError, OverflowError):  # none, or one torn by a power cut
+            steps = self._header.meta.get("max_steps")
+            longest = max((entry.length for entry in entries), default=0)
+            return max(longest, steps + 1 if isinstance(steps, int) else 0)
 
     def _check_meta(self, header: Header) -> None:
         settings = [("frames", header.frames, self.frames)]
@@ -265,17 +312,36 @@ class EpisodeWriter:
 
     def _open_data(self, header: Header) -> None:
         for name in set(header.files) - self._files.keys():
-            self._files[name] = os.open(self.path / name, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+            self._files[name] = self._open(name)
         sync_directory(self.path)
 
+    def _open(self, name: str) -> int:
+        """Opens a file of the dataset for writing, made if missing; never through a link."""
+        path = self.path / name
+        if os.path.lexists(path):
+            require_regular_file(path, links=False)
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | NO_FOLLOW, 0o644)
+
+    def _sizes(self) -> dict[str, int]:
+        """Bytes of each data file that belong to committed episodes."""
+        rows = {f"{key}.memmap": self.num_steps * self._header.row_bytes(key) for key in self._header.mapped}
+        if self.frames == "raw":
+            return rows
+        return {BLOB: self._blob_bytes, OFFSETS: self.num_steps * OFFSET_DTYPE.itemsize, **rows}
+
     def _truncate(self) -> None:
-        """Cuts the index, then the data, back to the last committed episode."""
-        os.ftruncate(self._index, self._index_bytes)
-        sizes = {BLOB: self._blob_bytes, OFFSETS: self.num_steps * OFFSET_DTYPE.itemsize}
-        if self._header:
-            sizes |= {f"{key}.memmap": self.num_steps * self._header.row_bytes(key) for key in self._header.mapped}
+        """Cuts the data, then the index, back to the last committed episode.
+
+        The unfinished line of the index says how much a crash left behind, so it goes last; its end, if it has one
+        already, goes first.
+        """
+        end = os.fstat(self._index).st_size
+        if end > self._index_bytes and os.pread(self._index, 1, end - 1) == b"\n":
+            os.ftruncate(self._index, end - 1)
+        sizes = self._sizes() if self._header else {}
         for name, descriptor in self._files.items():
             os.ftruncate(descriptor, sizes.get(name, 0))
+        os.ftruncate(self._index, self._index_bytes)
 
 
 def _to_builtin(value: Any) -> Any:

@@ -127,13 +127,13 @@ def test_another_file_or_other_settings_do_not_continue_a_dataset(tmp_path, offi
 
 def test_a_small_disk_is_noticed_before_anything_is_written(tmp_path, official, monkeypatch):
     path, _ = official
-    usage = namedtuple("usage", "free")
-    monkeypatch.setattr(shutil, "disk_usage", lambda place: usage(2**28 + 300_000))  # the reserve, and 0.3 MB
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: usage(2**40, 0, 2**28 + 300_000))  # the reserve, and 0.3 MB
     for frames in ("raw", "png"):
         needs = frames == "raw"
         target = tmp_path / frames
         if needs:
-            with pytest.raises(OSError, match="needs 0.00 GB"):
+            with pytest.raises(OSError, match="needs 0.[0-9] MB and a reserve"):
                 convert(path, target, progress=False)
             assert not (target / "meta.json").exists()
         else:

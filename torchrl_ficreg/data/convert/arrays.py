@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from torchrl_ficreg.data.convert.source import EpisodeSource
 from torchrl_ficreg.data.convert.table import Column, Table
@@ -26,7 +27,7 @@ class ArrayTable(Table):
     format = "arrays"
 
     def __init__(self, arrays: Mapping[str, Any], lengths: Sequence[int] | np.ndarray) -> None:
-        lengths = np.asarray(lengths, np.int64).reshape(-1)
+        lengths = _whole_numbers(lengths, "lengths")
         rows = {name: len(array) for name, array in arrays.items()}
         total = int(lengths.sum())
         if set(rows.values()) != {total} or (lengths < 1).any():
@@ -50,11 +51,12 @@ def from_arrays(
     *,
     pixels: Any,
     action: Any,
-    state: Any,
+    state: Any = None,
     lengths: Sequence[int] | np.ndarray | None = None,
     episode_ends: Sequence[int] | np.ndarray | None = None,
     env: str | None = None,
     shift: int = 0,
+    skip_bad_episodes: bool = False,
 ) -> EpisodeSource:
     """Episodes in arrays of one's own.
 
@@ -62,14 +64,15 @@ def from_arrays(
     an episode has as its action is not used.
 
     Keyword Args:
-        pixels: [N, H, W, 3] or [N, 3, H, W] uint8. This and the others may be numpy arrays, ``np.memmap``, or datasets
-            of h5py or zarr: anything with ``shape``, ``dtype`` and slices.
+        pixels: [N, H, W, 3] or [N, 3, H, W] uint8. This and the others may be numpy arrays, ``np.memmap``, torch
+            tensors, lists, or datasets of h5py or zarr: anything with ``shape``, ``dtype`` and slices.
         action: [N, A].
-        state: [N, S].
+        state: [N, S]. Default: none. No loss reads it; alignment is not verified and no pairs are drawn without it.
         lengths: [E], rows of each episode.
         episode_ends: [E], one past the last row of each episode; instead of ``lengths``.
         env: name of the environment, for the record.
         shift: see :class:`EpisodeSource`.
+        skip_bad_episodes: see :meth:`EpisodeSource.leave_out_bad_episodes`. Default: ``False``.
 
     Returns:
         What :func:`convert` takes.
@@ -94,9 +97,55 @@ def from_arrays(
     """
     if (lengths is None) == (episode_ends is None):
         raise ValueError("pass exactly one of lengths= (rows of each episode) and episode_ends= (one past the last).")
-    if pixels.dtype != np.uint8:
-        raise ValueError(f"pixels must be uint8 from 0 to 255, got {pixels.dtype}: scale and convert them first.")
+    given = {"pixels": pixels, "action": action, "state": state}
+    arrays = {name: _as_array(value, name) for name, value in given.items() if name != "state" or value is not None}
+    got = arrays["pixels"]
+    if got.dtype != np.uint8 or len(got.shape) != 4:
+        raise ValueError(
+            f"pixels must be uint8 from 0 to 255 of shape [N, H, W, 3] or [N, 3, H, W], got {got.dtype} of shape "
+            f"{list(got.shape)}: scale and convert them first."
+        )
     if lengths is None:
-        lengths = np.diff(np.asarray(episode_ends, np.int64), prepend=0)
-    table = ArrayTable({"pixels": pixels, "action": action, "state": state}, lengths)
-    return EpisodeSource(table, env=env, state=["state"], pixels="pixels", action="action", shift=shift)
+        lengths = np.diff(_whole_numbers(episode_ends, "episode_ends"), prepend=0)
+    return EpisodeSource(
+        ArrayTable(arrays, lengths),
+        env=env,
+        state=["state"] if state is not None else None,
+        pixels="pixels",
+        action="action",
+        shift=shift,
+        skip_bad_episodes=skip_bad_episodes,
+    )
+
+
+def _as_array(value: Any, name: str) -> Any:
+    """Something with ``shape``, ``dtype`` and slices, without a copy where that can be.
+
+    Raises:
+        TypeError: it holds no numbers.
+    """
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu()
+        value = (value.float() if value.dtype == torch.bfloat16 else value).numpy()
+    elif not (hasattr(value, "shape") and hasattr(value, "dtype")):
+        try:
+            whole = value if isinstance(value, Sequence) else list(value)
+            value = np.asarray([_as_array(row, name) for row in whole] if _holds_tensors(whole) else whole)
+        except (ValueError, TypeError) as error:
+            raise TypeError(f"{name} must be an array of numbers, got a {type(value).__name__} ({error}).") from error
+        if name == "pixels" and value.dtype.kind in "iu" and value.size and 0 <= value.min() and value.max() <= 255:
+            value = value.astype(np.uint8)
+    if not len(value.shape) or np.dtype(value.dtype).kind not in "biuf":
+        raise TypeError(f"{name} must be an array of numbers with one row per step, got {value.dtype} {value.shape}.")
+    return value
+
+
+def _holds_tensors(values: Sequence[Any]) -> bool:
+    return len(values) > 0 and isinstance(values[0], torch.Tensor)
+
+
+def _whole_numbers(values: Any, name: str) -> np.ndarray:
+    values = _as_array(values, name)
+    if not np.array_equal(np.asarray(values).astype(np.int64), values):
+        raise ValueError(f"{name} must be whole numbers of rows, got {np.asarray(values).reshape(-1)[:4].tolist()}.")
+    return np.asarray(values).astype(np.int64).reshape(-1)

@@ -10,8 +10,8 @@ from torchrl_ficreg.data.convert.images import decode
 from torchrl_ficreg.data.convert.table import Column, require
 
 
-def describe(kind: Any, cell: Any, rows: int) -> Column:
-    """Says what an Arrow column holds.
+def describe(kind: Any, cell: Any, rows: int) -> Column | str:
+    """Says what an Arrow column holds, or why it cannot be read.
 
     Args:
         kind: its ``pyarrow.DataType``.
@@ -22,8 +22,8 @@ def describe(kind: Any, cell: Any, rows: int) -> Column:
     if picture is not None:
         try:
             return Column(decode([picture]).shape[1:], "image", rows)
-        except ValueError:
-            return Column((), "text", rows)
+        except ValueError as error:
+            return f"holds no frames: {error}"
     types = require("pyarrow", "pylance").types
     shape: list[int] = []
     while isinstance(cell, list):
@@ -40,12 +40,19 @@ def picture_bytes(cell: Any) -> bytes | None:
     return cell if isinstance(cell, bytes) else None
 
 
-def to_array(values: Any, column: Column) -> np.ndarray:
+def split(columns: dict[str, Column | str]) -> tuple[dict[str, Column], dict[str, str]]:
+    """The columns that can be read, and why others cannot."""
+    readable = {name: column for name, column in columns.items() if isinstance(column, Column)}
+    return readable, {name: reason for name, reason in columns.items() if isinstance(reason, str)}
+
+
+def to_array(values: Any, column: Column, first_row: int = 0) -> np.ndarray:
     """Turns a ``ChunkedArray`` into an array.
 
     Args:
         values: L values of a column.
         column: what :func:`describe` said of it.
+        first_row: row of the first value, for messages. Default: 0.
 
     Returns:
         [L, *shape].
@@ -59,7 +66,7 @@ def to_array(values: Any, column: Column) -> np.ndarray:
         cells = [picture_bytes(cell) for cell in values.to_pylist()]
         if None in cells:
             raise ValueError("a frame holds no bytes: it refers to a file outside the table")
-        return decode(cells)
+        return decode(cells, column.shape, first_row=first_row)
     flat = values.combine_chunks()
     compute = require("pyarrow.compute", "pylance")
     for width in column.shape:

@@ -10,7 +10,7 @@ from torchrl_ficreg.data.convert.lance import LanceTable
 from torchrl_ficreg.data.convert.lerobot import INFO, LeRobotTable
 from torchrl_ficreg.data.convert.npz import NpzTable
 from torchrl_ficreg.data.convert.source import EpisodeSource
-from torchrl_ficreg.data.convert.table import Table
+from torchrl_ficreg.data.convert.table import reading, some, Table
 from torchrl_ficreg.data.layout import META_FILE
 
 FORMATS: dict[str, Callable[[Path], Table]] = {
@@ -50,8 +50,7 @@ def detect_format(path: str | Path) -> str:
     path = Path(path).expanduser()
     if path.is_dir():
         return _detect_folder(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no file or folder at {path}: correct the path.")
+    _check_exists(path)
     with open(path, "rb") as file:
         head = file.read(8)
     if head == b"\x89HDF\r\n\x1a\n":
@@ -65,6 +64,13 @@ def detect_format(path: str | Path) -> str:
     raise ValueError(f"{path} has no known format; {_KNOWN}: name it by format= if it is one of them.")
 
 
+def _check_exists(path: Path) -> None:
+    if not path.exists():
+        raise FileNotFoundError(f"no file or folder at {path}: correct the path.")
+    if not (path.is_file() or path.is_dir()):  # reading a pipe would wait for its writer
+        raise ValueError(f"{path} is neither a file nor a folder, but a pipe or a device: copy the data to a file.")
+
+
 def _detect_folder(path: Path) -> str:
     if (path / "_versions").is_dir():
         return "lance"
@@ -72,9 +78,15 @@ def _detect_folder(path: Path) -> str:
         return "lerobot"
     if (path / META_FILE).is_file():
         raise ValueError(f"{path} is a dataset of this package already: open it with OfflineTrajectories.")
-    inside = sorted(entry.name for entry in path.iterdir() if entry.suffix in (".h5", ".hdf5", ".lance", ".npz"))
+    names = {entry.name for entry in path.iterdir() if not entry.name.startswith(".")}
+    if {"ep_len.npz", "ep_offset.npz"} <= names:
+        raise ValueError(
+            f"{path} is a folder of stable-worldmodel with a file per column, or with videos, which is not read: write it "
+            "as HDF5 or Lance there, or load its arrays and frames and use from_arrays(pixels=..., action=..., lengths=...)."
+        )
+    inside = sorted(name for name in names if Path(name).suffix in (".h5", ".hdf5", ".lance", ".npz"))
     if inside:
-        raise ValueError(f"{path} is a folder of data sets: choose one of {', '.join(inside)} in it.")
+        raise ValueError(f"{path} is a folder of data sets: choose one of {some(inside)} in it.")
     raise ValueError(f"{path} has no known format; {_KNOWN}.")
 
 
@@ -88,6 +100,7 @@ def open_source(
     action: str | None = None,
     shift: int = 0,
     allow_incomplete: bool = False,
+    skip_bad_episodes: bool = False,
 ) -> EpisodeSource:
     """Opens a file or folder of somebody else's episodes.
 
@@ -102,6 +115,7 @@ def open_source(
         action: the column of actions.
         shift: rows by which the actions are moved.
         allow_incomplete: leave out the episodes that an interrupted recording did not finish.
+        skip_bad_episodes: leave out the episodes that are damaged, or hold a NaN or an infinity. Default: ``False``.
 
     Returns:
         the episodes, to be passed to :func:`convert` and closed after use.
@@ -115,13 +129,24 @@ def open_source(
     path = Path(path).expanduser()
     if format != "auto" and format not in FORMATS:
         raise ValueError(f"unknown format {format!r}: choose auto or one of {sorted(FORMATS)}.")
-    if not path.exists():
-        raise FileNotFoundError(f"no file or folder at {path}: correct the path.")
-    table = FORMATS[detect_format(path) if format == "auto" else format](path)
+    _check_exists(path)
+    reader = FORMATS[detect_format(path) if format == "auto" else format]
+    with reading(path):
+        # The others find out from the lengths of their columns what is not whole.
+        options = {"allow_incomplete": True} if allow_incomplete and reader in (NpzTable, LeRobotTable) else {}
+        table = reader(path, **options)
     try:
-        return EpisodeSource(
-            table, env=env, state=state, pixels=pixels, action=action, shift=shift, allow_incomplete=allow_incomplete
-        )
+        with reading(path):
+            return EpisodeSource(
+                table,
+                env=env,
+                state=state,
+                pixels=pixels,
+                action=action,
+                shift=shift,
+                allow_incomplete=allow_incomplete,
+                skip_bad_episodes=skip_bad_episodes,
+            )
     except BaseException:
         table.close()
         raise

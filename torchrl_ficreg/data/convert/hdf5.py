@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import posixpath
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchrl_ficreg.data.convert.table import Bounds, bounds_from_ids, Column, require, Table
+from torchrl_ficreg.data.convert.table import (
+    Bounds,
+    bounds_from_reader,
+    brief,
+    Column,
+    MOST_ROWS,
+    require,
+    runs,
+    some,
+    Table,
+)
 
 LENGTH, OFFSET = "ep_len", "ep_offset"
 EPISODE_IDS = ("episode_idx", "ep_idx")
@@ -43,14 +54,22 @@ class HDF5Table(Table):
         try:
             self._file = h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES, rdcc_nslots=10_007)
         except OSError as error:
-            raise ValueError(f"{path} cannot be opened ({error}): it is damaged or still being written.") from error
+            advice = "it is damaged or still being written"
+            if "unable to lock file" in str(error) and "errno = 11" not in str(error):
+                advice = "this file system has no locks: set HDF5_USE_FILE_LOCKING=FALSE in the environment"
+            raise ValueError(f"{path} cannot be opened ({brief(error)}): {advice}.") from error
         try:
-            datasets: dict[str, Any] = {}
-            self._file.visititems(lambda name, item: _keep(datasets, name, item))
-            bounds = _episodes(datasets, path)
-            self._datasets = {name: data for name, data in datasets.items() if name not in (LENGTH, OFFSET)}
-            columns = {name: _describe(data) for name, data in self._datasets.items()}
-            super().__init__(path, columns, *bounds)
+            datasets, self.left_out = _find_datasets(self._file)
+            columns = {}
+            for name, data in datasets.items():
+                column = _describe(data)
+                if isinstance(column, str):
+                    self.left_out[name] = column
+                else:
+                    columns[name] = column
+            self._datasets = {name: datasets[name] for name in columns if name not in (LENGTH, OFFSET)}
+            bounds = _episodes({name: datasets[name] for name in columns}, self.left_out, path)
+            super().__init__(path, {name: columns[name] for name in self._datasets}, *bounds)
         except BaseException:
             self._file.close()
             raise
@@ -64,39 +83,143 @@ class HDF5Table(Table):
         self._file.close()
 
 
-def _keep(datasets: dict[str, Any], name: str, item: Any) -> None:
-    if hasattr(item, "shape") and item.shape:  # neither a group nor a single value
-        datasets[name] = item
+def _find_datasets(file: Any) -> tuple[dict[str, Any], dict[str, str]]:
+    """All arrays of a file, those reached by soft links too, and why others are left out.
+
+    Whatever would read another file is left out: a file from elsewhere must not copy private files into a dataset.
+    """
+    h5py = require("h5py")
+    datasets: dict[str, Any] = {}
+    left_out: dict[str, str] = {}
+    links: dict[str, str] = {}
+    seen: set[Any] = set()
+    pending = [("", file)]
+    while pending:
+        prefix, group = pending.pop()
+        address = h5py.h5o.get_info(group.id).addr
+        if address in seen:  # a group may hold a link to itself
+            continue
+        seen.add(address)
+        for name in group:
+            full = f"{prefix}{name}"
+            link = group.get(name, getlink=True)
+            if isinstance(link, h5py.SoftLink):
+                links[full] = posixpath.normpath(posixpath.join("/", prefix, link.path)).lstrip("/")
+            elif not isinstance(link, h5py.HardLink):
+                left_out[full] = f"is a link to another file ({brief(link.filename, 60)}), which is not followed"
+            else:
+                item = group[name]
+                if isinstance(item, h5py.Group):
+                    pending.append((f"{full}/", item))
+                elif isinstance(item, h5py.Dataset) and item.shape:  # neither a type nor a single value
+                    datasets[full] = item
+    for name in [name for name, data in datasets.items() if data.external]:
+        left_out[name] = "has its values in another file (external storage), which is not followed"
+        del datasets[name]
+    sources = {name for name, data in datasets.items() if not data.is_virtual}
+    for name in datasets.keys() - sources:
+        # In the order of HDF5 "." is this file. A source that is virtual itself could lead on to another one.
+        parts = datasets[name].virtual_sources()
+        if any(part.file_name != "." or part.dset_name.lstrip("/") not in sources for part in parts):
+            left_out[name] = "is a virtual data set of other files, which are not followed"
+            del datasets[name]
+    for _ in range(len(links)):  # links to links
+        before = len(links)
+        for name, place in list(links.items()):
+            inside = {found[len(place) :]: data for found, data in datasets.items() if f"{found}/".startswith(f"{place}/")}
+            if inside:
+                datasets.update({f"{name}{rest}": data for rest, data in inside.items()})
+                del links[name]
+        if len(links) == before:
+            break
+    left_out |= {name: f"is a link to {brief(place, 60)!r}, which is no array of this file" for name, place in links.items()}
+    return datasets, left_out
 
 
-def _describe(data: Any) -> Column:
+def _describe(data: Any) -> Column | str:
+    """What an array holds, or why it cannot be read."""
     rows, *shape = data.shape
-    kind = "text" if data.dtype.kind not in "biuf" else "image" if data.dtype == np.uint8 and len(shape) > 1 else "number"
+    try:
+        dtype = data.dtype
+    except TypeError as error:
+        return f"has a type that numpy does not know ({brief(error, 60)})"
+    kind = "text" if dtype.kind not in "biuf" else "image" if dtype == np.uint8 and len(shape) > 1 else "number"
     return Column(tuple(shape), kind, rows)
 
 
-def _episodes(datasets: dict[str, Any], path: Path) -> Bounds:
+def _episodes(datasets: dict[str, Any], left_out: dict[str, str], path: Path) -> Bounds:
     """Reads the episodes, from whichever description there is, and compares where there are two."""
+    for name in (LENGTH, OFFSET):
+        if name in left_out:
+            raise ValueError(f"{path}: {name!r} {left_out[name]}: copy it into the file.")
     ids = next((datasets[name] for name in EPISODE_IDS if name in datasets), None)
+    others = [data.shape[0] for name, data in datasets.items() if name not in (LENGTH, OFFSET)]
+    rows = max(others, default=0)
+    if ids is not None:
+        _check_declared(ids, min(rows, MOST_ROWS), path)
     if LENGTH not in datasets:
         if ids is None:
-            raise ValueError(
-                f"{path} has neither {LENGTH!r} nor {' nor '.join(map(repr, EPISODE_IDS))}, got {sorted(datasets)}: "
-                "read the arrays yourself and use from_arrays(..., lengths=...)."
-            )
-        return bounds_from_ids(ids[:], path)
-    lengths = np.asarray(datasets[LENGTH][:], np.int64).reshape(-1)
+            raise ValueError(_without_episodes(datasets, path))
+        return bounds_from_reader(lambda start, stop: ids[start:stop], ids.shape[0], path)
+    lengths = _integers(datasets[LENGTH], rows, path)
     if (lengths < 1).any():
         raise ValueError(f"{path}: {LENGTH} holds {int(lengths.min())}: the file is damaged, copy it again.")
+    if float(lengths.sum(dtype=np.float64)) > 2**62:
+        raise ValueError(f"{path}: {LENGTH} holds {int(lengths.max())} rows: the file is damaged, copy it again.")
     starts = np.cumsum(lengths) - lengths
     if OFFSET in datasets:
-        starts = np.asarray(datasets[OFFSET][:], np.int64).reshape(-1)
-        if starts.shape != lengths.shape or (starts < 0).any() or (starts[:-1] + lengths[:-1] > starts[1:]).any():
+        if datasets[OFFSET].shape == datasets[LENGTH].shape:
+            starts = _integers(datasets[OFFSET], rows, path)
+        if datasets[OFFSET].shape != datasets[LENGTH].shape or not _in_order(starts, lengths):
             raise ValueError(f"{path}: {OFFSET} and {LENGTH} contradict each other: the file is damaged.")
     if ids is not None:
-        found = ids[:].reshape(-1)
-        for start, length in zip(starts, lengths):
-            rows = found[start : start + length]
-            if len(rows) and (rows != rows[0]).any():
-                raise ValueError(f"{path}: rows {start} to {start + length} belong to several episodes: it is damaged.")
+        changes, _ = runs(lambda start, stop: ids[start:stop], ids.shape[0])
+        within = np.searchsorted(changes, starts + lengths, "left") - np.searchsorted(changes, starts, "right")
+        if within.any():
+            start, length = (int(bound[np.flatnonzero(within)[0]]) for bound in (starts, lengths))
+            raise ValueError(f"{path}: rows {start} to {start + length} belong to several episodes: it is damaged.")
     return Bounds(starts, lengths)
+
+
+def _in_order(starts: np.ndarray, lengths: np.ndarray) -> bool:
+    return bool((starts >= 0).all() and (starts[:-1] <= starts[1:] - lengths[:-1]).all())
+
+
+def _check_declared(data: Any, most: int, path: Path) -> None:
+    """Refuses an array that declares more than can be, before anything of it is allocated."""
+    name = data.name.lstrip("/")
+    if data.size > most or (not data.id.get_storage_size() and data.size and not data.is_virtual):
+        raise ValueError(f"{path}: {name!r} declares {data.size} values, more than were written: the file is damaged.")
+
+
+def _integers(data: Any, most: int, path: Path) -> np.ndarray:
+    """Reads ``ep_len`` or ``ep_offset``."""
+    _check_declared(data, most, path)
+    name, values = data.name.lstrip("/"), None
+    if data.dtype.kind in "iuf":
+        values = data[:].reshape(-1)
+        with np.errstate(invalid="ignore"):
+            whole = values.astype(np.int64)
+        if (whole == values).all():
+            return whole
+    got = f"{values[np.flatnonzero(whole != values)[0]]}" if values is not None else f"values of type {data.dtype}"
+    raise ValueError(f"{path}: {name!r} must hold whole numbers, got {got}: the file is damaged, or write it as integers.")
+
+
+def _without_episodes(datasets: dict[str, Any], path: Path) -> str:
+    """The message for a file that does not say where its episodes are."""
+    groups: dict[str, set[str]] = {}
+    for name in datasets:
+        for depth in range(1, min(name.count("/"), 2) + 1):
+            parts = name.split("/")
+            groups.setdefault("/".join(parts[:depth]), set()).add("/".join(parts[depth:]))
+    alike = [name for name in groups if sum(groups[other] == groups[name] for other in groups) > 1]
+    if alike:
+        return (
+            f"{path} keeps every episode in a group of its own ({len(alike)} groups such as {brief(alike[0], 40)!r}): "
+            "join their arrays and use from_arrays(pixels=..., action=..., lengths=...)."
+        )
+    return (
+        f"{path} has neither {LENGTH!r} nor {' nor '.join(map(repr, EPISODE_IDS))}, got {some(sorted(datasets))}: read "
+        "the arrays yourself and use from_arrays(..., lengths=...)."
+    )

@@ -9,39 +9,59 @@ import numpy as np
 import torch
 from torch.nn.functional import interpolate
 
-from torchrl_ficreg.data.convert.table import require
+from torchrl_ficreg.data.convert.table import brief, require
 from torchrl_ficreg.data.threads import default_threads, run_split
 
 
-def decode(cells: Sequence[bytes]) -> np.ndarray:
-    """Decodes pictures (JPEG, PNG, WebP, ...) on several threads: the decoder releases the interpreter.
+# Pillow also knows formats that start other programs, such as EPS.
+_PICTURES = ("JPEG", "PNG", "WEBP")
+
+MOST_PIXELS = 4096 * 4096  # of one frame; a small file can declare a picture that fills the memory
+
+
+def decode(cells: Sequence[bytes], shape: tuple[int, ...] | None = None, *, first_row: int = 0) -> np.ndarray:
+    """Decodes pictures (JPEG, PNG, WebP) on several threads: the decoder releases the interpreter.
 
     Args:
         cells: encoded pictures of one size.
+        shape: [H, W, 3], the size they must have, compared before a picture is decoded. Default: that of the first.
+
+    Keyword Args:
+        first_row: row of the first picture, for messages. Default: 0.
 
     Returns:
         [L, H, W, 3] uint8.
 
     Raises:
         ImportError: Pillow is missing.
-        ValueError: a picture is damaged, or they differ in size.
+        ValueError: a picture is damaged, of another format or too large, or they differ in size.
     """
     image = require("PIL.Image", "pillow")
 
-    frames: list[np.ndarray] = [np.empty(0)] * len(cells)
+    def size_of(row: int) -> tuple[int, int, int]:
+        with image.open(io.BytesIO(cells[row]), formats=_PICTURES) as picture:
+            return (picture.height, picture.width, 3)
 
     def work(start: int, stop: int) -> None:
         for row in range(start, stop):
             try:
-                frames[row] = np.asarray(image.open(io.BytesIO(cells[row])).convert("RGB"))
-            except OSError as error:
-                raise ValueError(f"a frame of {len(cells[row])} bytes cannot be decoded ({error})") from error
+                if size_of(row) != shape:
+                    raise ValueError(f"it is {size_of(row)}, the others are {shape}: frames must have one size")
+                with image.open(io.BytesIO(cells[row]), formats=_PICTURES) as picture:
+                    frames[row] = np.asarray(picture.convert("RGB"))
+            except Exception as error:  # Pillow raises what its decoders do: SyntaxError, struct.error, ...
+                raise ValueError(f"the picture of row {first_row + row} cannot be decoded ({brief(error)})") from error
 
+    if shape is None:
+        try:
+            shape = size_of(0)
+        except Exception as error:
+            raise ValueError(f"the picture of row {first_row} cannot be decoded ({brief(error)})") from error
+    if shape[0] * shape[1] > MOST_PIXELS:
+        raise ValueError(f"the picture of row {first_row} declares {shape[0]} x {shape[1]} pixels: scale it down first")
+    frames = np.empty((len(cells), *shape), np.uint8)
     run_split(work, len(cells), num_threads=default_threads())
-    sizes = {frame.shape for frame in frames}
-    if len(sizes) > 1:
-        raise ValueError(f"frames of one episode must have one size, got {sorted(sizes)}")
-    return np.stack(frames)
+    return frames
 
 
 def is_channels_last(shape: tuple[int, ...]) -> bool:
@@ -56,7 +76,10 @@ def is_channels_last(shape: tuple[int, ...]) -> bool:
     """
     if len(shape) == 3 and 3 in (shape[0], shape[2]):
         return shape[2] == 3
-    raise ValueError(f"a frame must be [H, W, 3] or [3, H, W], got {list(shape)}: choose another column by pixels=.")
+    raise ValueError(
+        f"a frame must be [H, W, 3] or [3, H, W], got {list(shape)}: choose another column by pixels=, or convert the "
+        "frames to RGB and use from_arrays()."
+    )
 
 
 def to_frames(images: np.ndarray) -> np.ndarray:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from torchrl_ficreg.data.convert.arrow import describe, to_array
-from torchrl_ficreg.data.convert.table import bounds_from_ids, check_steps, require, Table
+from torchrl_ficreg.data.convert.arrow import describe, split, to_array
+from torchrl_ficreg.data.convert.table import bounds_from_ids, check_inside, check_steps, require, some, Table
 
 EPISODE_IDS, STEPS = ("episode_idx", "ep_idx"), "step_idx"
 
@@ -29,18 +30,24 @@ class LanceTable(Table):
 
     def __init__(self, path: Path) -> None:
         lance = require("lance", "pylance")
-        try:
-            self._dataset = lance.dataset(str(path))
-            rows = self._dataset.count_rows()
-            head = self._dataset.to_table(limit=1)
-        except (OSError, ValueError) as error:
-            raise ValueError(f"{path} cannot be opened ({error}): it is damaged, or no Lance table.") from error
+        for folder, _, files in os.walk(path):
+            for file in files:
+                check_inside(Path(folder, file), path)
+        self._dataset = lance.dataset(str(path))
+        parts = [file for fragment in self._dataset.get_fragments() for file in fragment.metadata.files]
+        # A manifest may name other folders, or addresses in the network, as the place of its data.
+        if self._dataset.base_paths() or any(file.base_id is not None or not _is_plain(file.path) for file in parts):
+            raise ValueError(f"{path} keeps rows outside of its folder, which is not followed: copy the table as a whole.")
+        rows = self._dataset.count_rows()
+        head = self._dataset.to_table(limit=1)
         cells = head.to_pylist()[0] if rows else {}
-        columns = {field.name: describe(field.type, cells.get(field.name), rows) for field in head.schema}
+        columns, self.left_out = split(
+            {field.name: describe(field.type, cells.get(field.name), rows) for field in head.schema}
+        )
         ids = next((name for name in EPISODE_IDS if name in columns), None)
         if ids is None:
             raise ValueError(
-                f"{path} has no column {' or '.join(EPISODE_IDS)}, got {sorted(columns)}: read the columns yourself "
+                f"{path} has no column {' or '.join(EPISODE_IDS)}, got {some(sorted(columns))}: read the columns yourself "
                 "and use from_arrays(..., lengths=...)."
             )
         bounds = bounds_from_ids(self._column(ids), path)
@@ -51,7 +58,13 @@ class LanceTable(Table):
     def read(self, name: str, start: int, stop: int) -> np.ndarray:
         """Reads, and decodes, rows of a column; see :meth:`Table.read`."""
         rows = self._dataset.to_table(columns=[name], offset=start, limit=stop - start)
-        return to_array(rows.column(0), self.columns[name])
+        return to_array(rows.column(0), self.columns[name], start)
 
     def _column(self, name: str) -> np.ndarray:
         return self._dataset.to_table(columns=[name]).column(0).to_numpy()
+
+
+def _is_plain(name: str) -> bool:
+    """Whether a data file lies in the folder of its table."""
+    path = PurePosixPath(name)
+    return not path.is_absolute() and ".." not in path.parts and "://" not in name

@@ -8,8 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_ficreg.data.convert.arrow import describe, to_array
-from torchrl_ficreg.data.convert.table import bounds_from_ids, check_steps, require, Table
+from torchrl_ficreg.data.convert.arrow import describe, split, to_array
+from torchrl_ficreg.data.convert.table import (
+    Bounds,
+    bounds_from_ids,
+    brief,
+    check_inside,
+    check_steps,
+    require,
+    some,
+    Table,
+)
 
 INFO = "meta/info.json"
 EPISODE_IDS, STEPS = "episode_index", "frame_index"
@@ -25,6 +34,9 @@ class LeRobotTable(Table):
     Args:
         path: the folder.
 
+    Keyword Args:
+        allow_incomplete: take the whole episodes of the files that can be read. Default: ``False``.
+
     Raises:
         ImportError: pyarrow, which comes with pylance, is missing.
         ValueError: frames are in video files only, a file is damaged, or rows are missing.
@@ -32,39 +44,75 @@ class LeRobotTable(Table):
 
     format = "lerobot"
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, allow_incomplete: bool = False) -> None:
         self._parquet = require("pyarrow.parquet", "pylance")
-        files = sorted((path / "data").rglob("*.parquet"))
+        # Hidden files, such as the ._ ones that macOS writes beside every file of some disks, are no part of it.
+        found = sorted((path / "data").rglob("*.parquet"))
+        files = [file for file in found if not any(part.startswith(".") for part in file.relative_to(path).parts)]
         if not files:
             raise ValueError(f"{path} has no data/**/*.parquet: the download is incomplete, fetch it again.")
         info = _read_info(path)
+        self.notices, self._files = [], []
         try:
-            self._files = [self._parquet.ParquetFile(file) for file in files]
-            rows = [file.metadata.num_rows for file in self._files]
-            # Where every row group of every file begins, counted over all files.
-            groups = [
-                (file, group, file.metadata.row_group(group).num_rows)
-                for file in self._files
-                for group in range(file.metadata.num_row_groups)
-            ]
-            ids = np.concatenate([file.read([EPISODE_IDS]).column(0).to_numpy() for file in self._files])
-            steps = np.concatenate([file.read([STEPS]).column(0).to_numpy() for file in self._files])
-            head = next(self._files[0].iter_batches(batch_size=1), None)
-        except (OSError, ValueError, KeyError, IndexError) as error:
-            raise ValueError(f"{path} cannot be read ({error}): a file is damaged, fetch it again.") from error
+            self._open(path, files, info, allow_incomplete)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, path: Path, files: list[Path], info: dict[str, Any], allow_incomplete: bool) -> None:
+        torn = 0
+        parts: list[tuple[np.ndarray, np.ndarray]] = []
+        for file in files:
+            check_inside(file, path)
+            try:
+                opened = self._parquet.ParquetFile(file)
+                columns = opened.read([EPISODE_IDS, STEPS])
+                parts.append(tuple(columns.column(name).to_numpy() for name in (EPISODE_IDS, STEPS)))
+            except Exception as error:  # Arrow's own errors, and what broken sizes lead to
+                if not allow_incomplete:
+                    raise ValueError(
+                        f"{file} cannot be read ({brief(error, 80)}): it is damaged or its recording was interrupted: "
+                        "fetch or record it again, or pass allow_incomplete=True to leave it out."
+                    ) from error
+                torn += 1
+                continue
+            self._files.append(opened)
+        if not self._files:
+            raise ValueError(f"{path}: none of its {len(files)} parquet files can be read: fetch it again.")
+        if torn:
+            self.notices.append(f"{torn} of {len(files)} files cannot be read and are left out")
+        total = sum(file.metadata.num_rows for file in self._files)
+        expected = info.get("total_frames", total)
+        if expected != total and not allow_incomplete:
+            raise ValueError(
+                f"{path} is incomplete: {INFO} promises {expected} rows, found {total}: fetch it again, or pass "
+                "allow_incomplete=True to take the whole episodes."
+            )
+        ids, steps = (np.concatenate(columns) for columns in zip(*parts))
+        bounds = bounds_from_ids(ids, path)
+        if allow_incomplete:
+            bounds = self._whole(bounds, ids, steps, path)
+            promised = info.get("total_episodes")
+            if isinstance(promised, int) and promised > len(bounds.lengths):
+                self.notices.append(f"{promised - len(bounds.lengths)} of {promised} episodes are missing or incomplete")
+        else:
+            check_steps(steps, bounds, path)
+        groups = [
+            (file, group, file.metadata.row_group(group).num_rows)
+            for file in self._files
+            for group in range(file.metadata.num_row_groups)
+        ]
+        head = next(self._files[0].iter_batches(batch_size=1), None)
+        # Where every row group of every file begins, counted over all files.
         self._groups = [(file, group) for file, group, _ in groups]
         self._group_starts = np.cumsum([0, *(count for _, _, count in groups)])
-        total = sum(rows)
-        expected = info.get("total_frames", total)
-        if expected != total:
-            raise ValueError(f"{path} is incomplete: {INFO} promises {expected} rows, found {total}: fetch it again.")
         cells = head.to_pylist()[0] if head is not None else {}
         schema = self._files[0].schema_arrow
-        columns = {field.name: describe(field.type, cells.get(field.name), total) for field in schema}
+        columns, self.left_out = split(
+            {field.name: describe(field.type, cells.get(field.name), total) for field in schema}
+        )
         if not any(column.kind == "image" for column in columns.values()):
             _refuse_videos(path, info)
-        bounds = bounds_from_ids(ids, path)
-        check_steps(steps, bounds, path)
         super().__init__(path, columns, *bounds)
 
     def read(self, name: str, start: int, stop: int) -> np.ndarray:
@@ -84,7 +132,20 @@ class LeRobotTable(Table):
                 row += len(batch)
                 if row >= stop:
                     break
-        return to_array(arrow.chunked_array(pieces), self.columns[name])
+        return to_array(arrow.chunked_array(pieces), self.columns[name], start)
+
+    def _whole(self, bounds: Bounds, ids: np.ndarray, steps: np.ndarray, path: Path) -> Bounds:
+        """The episodes whose steps count up from 0 and, where the folder says how long they are, to the end."""
+        declared = _declared_lengths(path, self._parquet)
+        kept = []
+        for start, length in zip(*bounds):
+            counted = np.array_equal(steps[start : start + length], np.arange(length))
+            kept.append(counted and declared.get(int(ids[start]), length) == length)
+        if not any(kept):
+            raise ValueError(f"{path} holds no whole episode: fetch or record it again.")
+        if not all(kept):
+            self.notices.append(f"{len(kept) - sum(kept)} incomplete episodes are left out")
+        return Bounds(bounds.starts[kept], bounds.lengths[kept])
 
     def close(self) -> None:
         """Closes the files."""
@@ -93,18 +154,43 @@ class LeRobotTable(Table):
 
 
 def _read_info(path: Path) -> dict[str, Any]:
+    check_inside(path / INFO, path)
     try:
-        return dict(json.loads((path / INFO).read_text()))
-    except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"{path / INFO} is no JSON object ({error}): fetch the data set again.") from error
+        info = json.loads((path / INFO).read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path / INFO} is no JSON object ({brief(error)}): fetch the data set again.") from error
+    if not isinstance(info, dict):
+        raise ValueError(f"{path / INFO} is no JSON object, but a {type(info).__name__}: fetch the data set again.")
+    rows = info.get("total_frames", 0)
+    if not isinstance(rows, int) or isinstance(rows, bool) or rows < 0:
+        raise ValueError(f"{path / INFO}: total_frames must be a number of rows, got {brief(rows)!r}: fetch it again.")
+    return info
+
+
+def _declared_lengths(path: Path, parquet: Any) -> dict[int, int]:
+    """Episode -> rows, from either generation's description; empty where there is none that can be read."""
+    lengths: dict[int, int] = {}
+    try:
+        if (path / "meta/episodes.jsonl").is_file():
+            for line in (path / "meta/episodes.jsonl").read_text().splitlines():
+                episode = json.loads(line)
+                lengths[int(episode[EPISODE_IDS])] = int(episode["length"])
+        for file in sorted((path / "meta/episodes").rglob("[!.]*.parquet")):
+            columns = parquet.read_table(file, columns=[EPISODE_IDS, "length"]).to_pydict()
+            lengths.update(zip(columns[EPISODE_IDS], columns["length"]))
+    except Exception:  # it only helps to find torn episodes
+        return lengths
+    return lengths
 
 
 def _refuse_videos(path: Path, info: dict[str, Any]) -> None:
-    features = info.get("features", {})
-    videos = sorted(name for name, feature in features.items() if feature.get("dtype") == "video")
+    features = info.get("features")
+    features = features if isinstance(features, dict) else {}
+    kinds = {name: feature.get("dtype") for name, feature in features.items() if isinstance(feature, dict)}
+    videos = sorted(name for name, kind in kinds.items() if kind == "video")
     if videos:
         raise ValueError(
-            f"{path} keeps {', '.join(videos)} in video files, which this package does not decode: record or export "
+            f"{path} keeps {some(videos, 2)} in video files, which this package does not decode: record or export "
             "the data set with images (use_videos=False in lerobot), or decode the frames with a library of your "
             "choice and use from_arrays()."
         )

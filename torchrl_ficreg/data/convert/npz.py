@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from math import prod
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 from numpy.lib import format as npy
 
-from torchrl_ficreg.data.convert.table import Bounds, Column, Table
+from torchrl_ficreg.data.convert.table import Bounds, brief, Column, MOST_ROWS, runs, some, Table
 
 TERMINALS = "terminals"
 _SKIP_BYTES = 1024 * 1024
@@ -31,13 +32,16 @@ class NpzTable(Table):
     Args:
         path: the file.
 
+    Keyword Args:
+        allow_incomplete: leave out the rows after the last terminal one. Default: ``False``.
+
     Raises:
         ValueError: the archive is damaged, incomplete or without ``terminals``.
     """
 
     format = "ogbench"
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, allow_incomplete: bool = False) -> None:
         try:
             self._archive = zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile) as error:
@@ -46,9 +50,34 @@ class NpzTable(Table):
             names = [name.removesuffix(".npy") for name in self._archive.namelist()]
             if TERMINALS not in names:
                 raise ValueError(f"{path} has no {TERMINALS!r}, got {sorted(names)}: use from_arrays(..., lengths=...).")
-            self._members = {name: _Member(self._archive, name) for name in names}
+            self._members, self.left_out = {}, {}
+            for name in names:
+                try:
+                    self._members[name] = _Member(self._archive, name)
+                except Exception as error:  # stray members, objects, damage: only what is asked for can refuse a file
+                    self.left_out[name] = f"cannot be read: {brief(error)}"
+            if TERMINALS in self.left_out:
+                raise ValueError(
+                    f"{path} cannot be read ({TERMINALS!r} {brief(self.left_out[TERMINALS])}): it is damaged, copy it again."
+                )
             columns = {name: member.column for name, member in self._members.items()}
-            super().__init__(path, columns, *_bounds(self._members[TERMINALS], path))
+            terminals = self._members[TERMINALS]
+            rows = {column.rows for name, column in columns.items() if name != TERMINALS}
+            if columns[TERMINALS].shape not in ((), (1,)) or terminals.column.rows not in rows:
+                raise ValueError(
+                    f"{path}: {TERMINALS!r} has shape {[terminals.column.rows, *terminals.column.shape]}, the other arrays "
+                    f"have {some([str(count) for count in sorted(rows)])} rows: the file is damaged."
+                )
+            bounds, rest = _bounds(terminals, path)
+            if rest:
+                escape = f", or pass allow_incomplete=True to take the {len(bounds.lengths)} whole episodes"
+                if not (allow_incomplete and len(bounds.lengths)):
+                    raise ValueError(
+                        f"{path}: the last episode has no terminal row: the file is incomplete, copy it again"
+                        f"{escape if len(bounds.lengths) else ''}."
+                    )
+                self.notices = [f"the {rest} rows after the last whole episode are left out"]
+            super().__init__(path, columns, *bounds)
         except (OSError, EOFError, NotImplementedError, zlib.error, zipfile.BadZipFile) as error:
             self._archive.close()
             raise ValueError(f"{path} cannot be read ({error}): it is damaged, copy it again.") from error
@@ -80,8 +109,11 @@ class _Member:
         if self.dtype == np.uint8 and len(shape) > 1:
             kind = "image"
         self.column = Column(tuple(shape), kind, rows)
-        self._row_bytes = self.dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+        self._row_bytes = self.dtype.itemsize * prod(shape)
         self.close()
+        size = archive.getinfo(self._name).file_size
+        if rows * self._row_bytes > size or rows > MOST_ROWS or not self._row_bytes:
+            raise ValueError(f"it declares {rows} rows of shape {shape}, and holds {size} bytes")
 
     def read(self, start: int, stop: int) -> np.ndarray:
         if self._stream is None or start < self._row:
@@ -113,9 +145,16 @@ class _Member:
             count -= got
 
 
-def _bounds(terminals: _Member, path: Path) -> Bounds:
-    ends = np.flatnonzero(terminals.read(0, terminals.column.rows).reshape(-1)) + 1
-    if not len(ends) or ends[-1] != terminals.column.rows:
-        raise ValueError(f"{path}: the last episode has no terminal row: the file is incomplete, copy it again.")
+def _bounds(terminals: _Member, path: Path) -> tuple[Bounds, int]:
+    """The episodes that end in a terminal row, and the number of rows after them."""
+    starts, values = runs(terminals.read, terminals.column.rows)
+    if not np.isin(values, (0, 1)).all():
+        wrong = int(np.flatnonzero(~np.isin(values, (0, 1)))[0])
+        raise ValueError(
+            f"{path}: {TERMINALS!r} holds {values[wrong]} in row {starts[wrong]}: 0 or 1 is expected, the file is damaged."
+        )
+    stops = np.append(starts[1:], terminals.column.rows)
+    ends = [np.arange(start, stop) + 1 for start, stop, value in zip(starts, stops, values) if value]
+    ends = np.concatenate([np.zeros(0, np.int64), *ends])
     lengths = np.diff(ends, prepend=0)
-    return Bounds(ends - lengths, lengths)
+    return Bounds(ends - lengths, lengths), terminals.column.rows - int(ends[-1] if len(ends) else 0)

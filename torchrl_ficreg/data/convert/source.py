@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from math import prod
 from typing import Any
 
 import numpy as np
 
-from torchrl_ficreg.data.convert.images import is_channels_last, resize, to_frames
-from torchrl_ficreg.data.convert.table import Table
+from torchrl_ficreg.data.convert.images import is_channels_last, MOST_PIXELS, resize, to_frames
+from torchrl_ficreg.data.convert.table import brief, is_foreign, Kind, some, Table
 from torchrl_ficreg.data.convert.tasks import OTHER_ACTIONS, OTHER_PIXELS, OTHER_STATES, TASKS
 from torchrl_ficreg.data.schema import ACTION, PIXELS, STATE
 
-# What the readers raise for bytes that are not what they should be.
-_DAMAGE = (OSError, EOFError, RuntimeError, ValueError, zlib.error, zipfile.BadZipFile)
-
 # Frames read and scaled at once. Long episodes at 224 pixels would otherwise need their size several times over.
 _BLOCK_ROWS = 200
+_BLOCK_BYTES = 64 * 2**20
+
+# Of one episode. A small file can declare more than any memory holds.
+_MOST_EPISODE_ROWS = 1_000_000
+_MOST_NUMBERS = 64_000_000
+_MOST_FRAME_BYTES = 16 * 2**30
 
 
 class EpisodeSource:
@@ -34,16 +37,18 @@ class EpisodeSource:
         env: one of ``two_room``, ``push_t``, ``reacher``, ``cube``: says which columns hold the state, and is noted
             in the dataset. Any other name is only noted.
         state: columns that make the state, joined in this order. Default: the environment's, or what other data
-            usually call it.
+            usually call it. Data without an ``env`` of this package may have none: [L, 0].
         pixels: the column of frames. Default ``pixels``, or what other data usually call it.
         action: the column of actions.
         shift: rows by which the actions are moved: ``-1`` where the file keeps an action in the row it leads to,
             ``1`` where it runs one row ahead. ``1`` costs the first row of each episode.
         allow_incomplete: leave out the episodes that an interrupted recording did not finish.
+        skip_bad_episodes: see :meth:`leave_out_bad_episodes`. Default: ``False``.
 
     Attributes:
         lengths: int64 [E], rows of each episode as served. Episodes of fewer than two rows are left out.
         skipped: how many were left out.
+        notices: what else was left out, one sentence each.
         columns: key -> the names of the columns it is made of.
 
     Raises:
@@ -61,6 +66,7 @@ class EpisodeSource:
         action: str | None = None,
         shift: int = 0,
         allow_incomplete: bool = False,
+        skip_bad_episodes: bool = False,
     ) -> None:
         if shift not in (-1, 0, 1):
             raise ValueError(f"shift must be -1, 0 or 1, got {shift}.")
@@ -69,8 +75,9 @@ class EpisodeSource:
         self.columns: dict[str, list[str]] = {
             PIXELS: self._choose(PIXELS, [(name,) for name in ([pixels] if pixels else self._usual_pixels())]),
             ACTION: self._choose(ACTION, [(name,) for name in ([action] if action else OTHER_ACTIONS)]),
-            STATE: self._choose(STATE, [[state] if isinstance(state, str) else state] if state else wanted),
         }
+        self.notices = list(table.notices)
+        self.columns[STATE] = self._choose_state(state, wanted)
         self.frame_shape = self._frame_shape()
         self.action_dim, self.state_dim = self._width(ACTION), self._width(STATE)
         self._check_task()
@@ -81,6 +88,34 @@ class EpisodeSource:
         self.skipped = whole - len(self._kept)
         if not len(self.lengths):
             raise ValueError(f"{table.path} holds no episode of two rows or more: there is nothing to convert.")
+        if skip_bad_episodes:
+            self.leave_out_bad_episodes()
+
+    def leave_out_bad_episodes(self) -> None:
+        """Reads everything once, and leaves out the episodes that cannot be read or hold a NaN or an infinity.
+
+        Which they are has to be known before the first one is written: a conversion that is continued must count the
+        same episodes.
+
+        Raises:
+            ValueError: no episode is good; the message says what is wrong with the first.
+        """
+        reasons: dict[int, ValueError] = {}
+        for index in range(len(self)):
+            try:
+                self._check_finite(index, *self.vectors(index))
+                for _ in self._blocks(index):
+                    pass
+            except ValueError as error:
+                reasons[index] = error
+        if not reasons:
+            return
+        if len(reasons) == len(self):
+            raise ValueError(f"all {len(self)} episodes are bad; the first: {brief(reasons[0], 240)}") from reasons[0]
+        first = brief(reasons[min(reasons)], 180)
+        self.notices.append(f"{len(reasons)} of {len(self)} episodes are bad and left out; the first: {first}")
+        good = np.delete(np.arange(len(self)), list(reasons))
+        self._kept, self.lengths = self._kept[good], self.lengths[good]
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -100,15 +135,8 @@ class EpisodeSource:
             ValueError: the file is damaged there, or holds a NaN or an infinity.
         """
         action, state = self.vectors(index)
+        self._check_finite(index, action, state)
         action[-1] = 0
-        for key, value in ((ACTION, action), (STATE, state)):
-            bad = np.flatnonzero(~np.isfinite(value).all(-1))
-            if len(bad):
-                raise ValueError(
-                    f"{self.table.path}, episode {index}: {' and '.join(self.columns[key])} holds a NaN or an infinity "
-                    f"in row {bad[0]} of {len(value)}; only the action of the last row may be missing. If it is the "
-                    "first one instead, the actions are stored where they lead to: shift=-1."
-                )
         return {PIXELS: self._frames(index, image_size or self.frame_shape), ACTION: action, STATE: state}
 
     def vectors(self, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -121,7 +149,8 @@ class EpisodeSource:
             action [L, A] float32, the last row as the file has it (NaN where it has none), and state [L, S] float64.
         """
         start, stop = self._rows(index)
-        action = self._joined(ACTION, start, stop).astype(np.float32)
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes an infinity, and is refused as one
+            action = self._joined(ACTION, start, stop).astype(np.float32)
         state = self._joined(STATE, start, stop)
         if self.shift:
             action = np.roll(action, self.shift, axis=0)
@@ -153,43 +182,93 @@ class EpisodeSource:
 
     def _rows(self, index: int) -> tuple[int, int]:
         episode = self._kept[index]
-        start = int(self.table.starts[episode])
-        return start, start + int(self.table.lengths[episode])
+        start, length = int(self.table.starts[episode]), int(self.table.lengths[episode])
+        if length > _MOST_EPISODE_ROWS or length * (self.action_dim + self.state_dim) > _MOST_NUMBERS:
+            raise ValueError(
+                f"{self.table.path}, episode {index} has {length} rows of {self.action_dim + self.state_dim} numbers, more "
+                f"than are read at once ({_MOST_EPISODE_ROWS} rows, {_MOST_NUMBERS} numbers): divide it, or correct the "
+                "lengths of the episodes."
+            )
+        return start, start + length
+
+    def _check_finite(self, index: int, action: np.ndarray, state: np.ndarray) -> None:
+        for key, value in ((ACTION, action[:-1]), (STATE, state)):
+            bad = np.flatnonzero(~np.isfinite(value).all(-1))
+            if len(bad):
+                first = " Are the actions stored where they lead to? Then shift=-1." if key == ACTION and not bad[0] else ""
+                raise ValueError(
+                    f"{self.table.path}, episode {index}: {some(self.columns[key], 2)} holds a NaN or an infinity in row "
+                    f"{bad[0]} of {len(state)}: mend it, or pass skip_bad_episodes=True to leave such episodes out.{first}"
+                )
 
     def _read(self, name: str, start: int, stop: int) -> np.ndarray:
         try:
             rows = self.table.read(name, start, stop)
             if len(rows) != stop - start:
                 raise EOFError(f"got {len(rows)} rows")
-        except _DAMAGE as error:
+        except BaseException as error:
+            if not is_foreign(error):
+                raise
             raise ValueError(
-                f"{self.table.path}: rows {start} to {stop} of {name!r} cannot be read ({error}): the file is damaged, "
-                "copy it again."
+                f"{self.table.path}: rows {start} to {stop} of {name!r} cannot be read ({brief(error)}): the file is "
+                "damaged: copy it again, or pass skip_bad_episodes=True to leave such episodes out."
             ) from error
         return rows
 
     def _joined(self, key: str, start: int, stop: int) -> np.ndarray:
+        if not self.columns[key]:
+            return np.empty((stop - start, 0))
         parts = [self._read(name, start, stop).reshape(stop - start, -1) for name in self.columns[key]]
         return np.concatenate(parts, axis=1, dtype=np.float64)
 
     def _frames(self, index: int, size: tuple[int, int]) -> np.ndarray:
+        rows = int(self.lengths[index])
+        if rows * 3 * size[0] * size[1] > _MOST_FRAME_BYTES:
+            raise ValueError(
+                f"{self.table.path}, episode {index} has {rows} frames of {size[0]} x {size[1]}, more than fit in memory: "
+                "pass a smaller image_size=, or divide it."
+            )
+        frames, done = np.empty((rows, 3, *size), np.uint8), 0
+        for images in self._blocks(index):
+            frames[done : done + len(images)] = resize(images, size)
+            done += len(images)
+        return frames
+
+    def _blocks(self, index: int) -> Iterator[np.ndarray]:
+        """The frames of an episode [L', 3, H, W], as many at once as memory is sure to take."""
         start, stop = self._rows(index)
         start += max(self.shift, 0)
-        frames = np.empty((stop - start, 3, *size), np.uint8)
-        for block in range(start, stop, _BLOCK_ROWS):
-            end = min(block + _BLOCK_ROWS, stop)
+        step = min(max(_BLOCK_BYTES // (3 * self.frame_shape[0] * self.frame_shape[1]), 1), _BLOCK_ROWS)
+        for block in range(start, stop, step):
+            end = min(block + step, stop)
             images = to_frames(self._read(self.columns[PIXELS][0], block, end))
             if images.shape[2:] != self.frame_shape:
                 raise ValueError(
                     f"{self.table.path}: the frames of rows {block} to {end} are {images.shape[2:]}, those of the "
                     f"first row {self.frame_shape}: frames must have one size."
                 )
-            frames[block - start : end - start] = resize(images, size)
-        return frames
+            yield images
 
     def _usual_pixels(self) -> list[str]:
         cameras = [name for name in self.table.of_kind("image") if name.startswith("observation.images.")]
         return [*OTHER_PIXELS, *(cameras if len(cameras) == 1 else [])]  # of several, the user has to choose
+
+    def _choose_state(self, state: str | Sequence[str] | None, usual: Sequence[Sequence[str]]) -> list[str]:
+        """No loss reads the state, so that data of other environments may have none."""
+        if state is not None and len(state):
+            return self._choose(STATE, [[state] if isinstance(state, str) else state])
+        try:
+            return self._choose(STATE, usual)
+        except KeyError:
+            if self.env in TASKS:
+                raise
+            numbers = [name for name in self.table.of_kind("number") if name not in self.columns[ACTION]]
+            there = f" (there are {some(numbers, 4)}: name them by state= to keep them)" if numbers else ""
+            self.notices.append(
+                f"no state was found{there}: a model can be trained on the result, but alignment cannot be verified, nor "
+                "start-goal pairs drawn"
+            )
+            return []
 
     def _choose(self, key: str, candidates: Sequence[Sequence[str]]) -> list[str]:
         """The first candidate all of whose columns are there, of the right kind."""
@@ -202,9 +281,30 @@ class EpisodeSource:
         there = self.table.of_kind(kind)
         role = f"{self.env}'s {key}" if self.env and key == STATE else key
         advice = f"name the column by {key}="
+        for name in dict.fromkeys(name for candidate in candidates for name in candidate):
+            reason = self._unfit(name, kind)
+            if reason:
+                raise KeyError(f"{self.table.path} has no {kind} column for {role}: {name!r} {reason}.")
         if key == PIXELS and not there:
             advice = "take the variant with images (OGBench: visual-...), or draw frames and use from_arrays()"
-        raise KeyError(f"{self.table.path} has no {kind} column for {role}: tried {tried}, got {there}: {advice}.")
+        raise KeyError(f"{self.table.path} has no {kind} column for {role}: tried {tried}, got {some(there)}: {advice}.")
+
+    def _unfit(self, name: str, kind: Kind) -> str | None:
+        """What is wrong with something of a wanted name that is there, and what to do."""
+        found = self.table.find(name)
+        if found is None:
+            return self.table.unusable(name)
+        column = self.table.columns[found]
+        if column.kind == kind:
+            return None
+        shape = [column.rows, *column.shape]
+        if kind != "image":
+            return f"holds {'frames' if column.kind == 'image' else 'text or objects'} {shape}: choose another column"
+        if (name,) in OTHER_STATES and len(column.shape) < 2:
+            return None  # the numbers of a file without images
+        if column.kind == "number" and len(column.shape) > 1:
+            return f"is no uint8 {shape}: scale it to 0..255, convert it to uint8 RGB and use from_arrays()"
+        return f"holds no frames, but {shape} (encoded pictures?): decode them to uint8 RGB and use from_arrays()"
 
     def _count_whole(self, allow_incomplete: bool) -> int:
         """Episodes all of whose rows are there."""
@@ -220,11 +320,21 @@ class EpisodeSource:
         return whole
 
     def _frame_shape(self) -> tuple[int, int]:
-        shape = self.table.columns[self.columns[PIXELS][0]].shape
-        return shape[:2] if is_channels_last(shape) else shape[1:]
+        name = self.columns[PIXELS][0]
+        shape = self.table.columns[name].shape
+        try:
+            size = shape[:2] if is_channels_last(shape) else shape[1:]
+        except ValueError as error:
+            raise ValueError(f"{self.table.path}: {name!r}: {error}") from error
+        if not 0 < size[0] * size[1] <= MOST_PIXELS:
+            raise ValueError(f"{self.table.path}: {name!r} declares frames of {list(shape)}: scale them down first.")
+        return size
 
     def _width(self, key: str) -> int:
-        return sum(int(np.prod(self.table.columns[name].shape, dtype=int)) for name in self.columns[key])
+        width = sum(prod(self.table.columns[name].shape) for name in self.columns[key])
+        if not width and self.columns[key]:
+            raise ValueError(f"{self.table.path}: {some(self.columns[key], 2)} holds no number: choose another by {key}=.")
+        return width
 
     def _check_task(self) -> None:
         if self.env not in TASKS:

@@ -17,7 +17,7 @@ from torchrl_ficreg.data.convert.formats import open_source
 from torchrl_ficreg.data.convert.source import EpisodeSource
 from torchrl_ficreg.data.convert.tasks import TASKS
 from torchrl_ficreg.data.frames import check_frame_format, encode_frames, FrameFormat
-from torchrl_ficreg.data.layout import estimate_bytes
+from torchrl_ficreg.data.layout import estimate_bytes, META_FILE
 from torchrl_ficreg.data.schema import PIXELS
 from torchrl_ficreg.data.space import require_space
 from torchrl_ficreg.data.writer import EpisodeWriter
@@ -37,6 +37,7 @@ def convert(
     image_size: int | None = None,
     limit: int | None = None,
     check_alignment: bool = True,
+    skip_bad_episodes: bool = False,
     progress: bool = True,
 ) -> Path:
     """Turns somebody else's data into a dataset of this package.
@@ -56,9 +57,12 @@ def convert(
         action_bounds: lowest and highest action, two vectors [A], noted for planning. Default: -1 and 1 for the four
             environments; otherwise the smallest and largest action in the file.
         frames: how they are stored: ``"raw"``, or compressed one by one as ``"webp"`` or ``"png"``.
-        image_size: pixels of a side to which frames are scaled. Default: as they are.
+        image_size: pixels of a side to which frames are scaled; frames that are not square are squeezed, with a
+            warning. Default: as they are.
         limit: at most so many episodes, from the first.
         check_alignment: refuse a file whose actions stand in other rows than they should.
+        skip_bad_episodes: leave out the episodes that are damaged, or hold a NaN or an infinity, and say how many. Reads
+            the data twice. Default: ``False``.
         progress: show a bar with frames per second and the time left.
 
     Returns:
@@ -89,7 +93,7 @@ def convert(
         (torch.Size([4, 4, 3, 8, 8]), 'arrays')
     """
     if not isinstance(source, EpisodeSource):
-        with open_source(source, env=env) as opened:
+        with open_source(source, env=env, skip_bad_episodes=skip_bad_episodes) as opened:
             return convert(
                 opened,
                 target,
@@ -102,11 +106,19 @@ def convert(
                 progress=progress,
             )
     _check_arguments(source, env, frames, image_size, limit)
+    if skip_bad_episodes:
+        source.leave_out_bad_episodes()
+    place = Path(target).expanduser()
+    if place.exists() and not place.is_dir():
+        raise ValueError(f"target={target} is a file: name a folder.")
     size = (image_size, image_size) if image_size else source.frame_shape
     count = min(limit or len(source), len(source))
     if source.skipped:
         warnings.warn(f"{source.table.path}: {source.skipped} episodes of fewer than two rows are left out.")
-    if check_alignment:
+    for notice in source.notices:
+        warnings.warn(f"{source.table.path}: {notice}.")
+    _tell_shape(source, size)
+    if check_alignment and source.state_dim:
         verify_alignment(source)
     low, high = _bounds(source, action_bounds)
     meta = {
@@ -118,14 +130,29 @@ def convert(
         "source": source.facts(),
     }
     meta = json.loads(json.dumps(meta, sort_keys=True))  # the order in which it comes back when resuming
+    if not (place / META_FILE).exists():  # before the folder is made
+        require_space(target, _needed_bytes(source, int(source.lengths[:count].sum()), size, frames))
     with EpisodeWriter(target, target_episodes=count, meta=meta, frames=frames) as writer:
         if not writer.complete:
-            rest = source.lengths[writer.num_episodes : count]
-            require_space(target, _needed_bytes(source, int(rest.sum()), size, frames))
+            if writer.num_episodes:
+                rest = source.lengths[writer.num_episodes : count]
+                require_space(target, _needed_bytes(source, int(rest.sum()), size, frames))
             for episode in _episodes(source, writer.num_episodes, count, size, progress):
                 writer.append(episode)
         writer.finish()
     return writer.path
+
+
+def _tell_shape(source: EpisodeSource, size: tuple[int, int]) -> None:
+    """Says what becomes of frames that are not square: the encoders of this package take square ones."""
+    height, width = source.frame_shape
+    if size[0] != size[1]:
+        warnings.warn(
+            f"{source.table.path}: frames of {height} x {width} are kept as they are, and the encoders of this package take "
+            "square ones: pass image_size= to squeeze them to a square, or cut them before."
+        )
+    elif height != width:
+        warnings.warn(f"{source.table.path}: frames of {height} x {width} are squeezed to {size[0]} x {size[1]}.")
 
 
 def verify_alignment(source: EpisodeSource) -> Alignment | None:
@@ -135,12 +162,14 @@ def verify_alignment(source: EpisodeSource) -> Alignment | None:
         source: the episodes; up to 50 of them, evenly spread, are looked at.
 
     Returns:
-        what was measured, or ``None`` where there are too few rows to tell.
+        what was measured, or ``None`` where there are too few rows to tell, or no state.
 
     Raises:
         ValueError: another lag than 0 explains the change of the state clearly better.
         UserWarning: (as a warning) no lag explains it, or there are too few rows.
     """
+    if not source.state_dim:
+        return None
     chosen = np.unique(np.linspace(0, len(source) - 1, _SAMPLED_EPISODES).astype(int))
     rows = int(source.lengths[chosen].sum())
     if rows < _ROWS_PER_NUMBER * (source.action_dim + 1):
@@ -183,7 +212,8 @@ def _bounds(
 ) -> tuple[list[float], list[float]]:
     if given is not None:
         low, high = (np.asarray(bound, float).reshape(-1) for bound in given)
-        if low.shape != (source.action_dim,) or high.shape != low.shape or not (low <= high).all():
+        fits = low.shape == high.shape == (source.action_dim,) and np.isfinite([low, high]).all()
+        if not fits or not (low <= high).all():
             raise ValueError(
                 f"action_bounds must be two vectors of {source.action_dim} numbers, lowest first, got {given}."
             )
@@ -193,7 +223,11 @@ def _bounds(
         low, high = np.full(source.action_dim, np.inf), np.full(source.action_dim, -np.inf)
         for index in range(len(source)):  # of the whole file, so that a larger limit changes nothing
             action = source.vectors(index)[0][:-1]
-            low, high = np.fmin(low, action.min(0)), np.fmax(high, action.max(0))
+            finite = np.where(np.isfinite(action), action, np.nan)  # what is not is refused when it is read
+            low, high = np.fmin(low, np.fmin.reduce(finite)), np.fmax(high, np.fmax.reduce(finite))
+        if not (low <= high).all():
+            wrong = int(np.flatnonzero(~(low <= high))[0])
+            raise ValueError(f"{source.table.path}: no action has a number in component {wrong}: choose another column.")
     return low.tolist(), high.tolist()
 
 

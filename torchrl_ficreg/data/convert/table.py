@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -13,6 +14,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 Kind = Literal["number", "image", "text"]
+
+MOST_ROWS = 1_000_000_000  # of one file; a small file can declare more than any memory holds
+_PIECE_ROWS = 1_000_000  # read at once of columns that cover the whole file
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,8 @@ class Table(ABC):
     """
 
     format: str
+    notices: Sequence[str] = ()  # what was left out on request, for the summary of a conversion
+    left_out: Mapping[str, str] = {}  # name -> why what the file holds there is no column
 
     def __init__(self, path: Path, columns: Mapping[str, Column], starts: np.ndarray, lengths: np.ndarray) -> None:
         if not len(lengths):
@@ -53,6 +59,11 @@ class Table(ABC):
         self.columns = dict(columns)
         self.starts = np.asarray(starts, np.int64)
         self.lengths = np.asarray(lengths, np.int64)
+
+    def unusable(self, name: str) -> str | None:
+        """Why there is no column of that name, where the file holds something under it."""
+        plain = _plain(name)
+        return next((reason for other, reason in self.left_out.items() if _plain(other) == plain), None)
 
     @abstractmethod
     def read(self, name: str, start: int, stop: int) -> np.ndarray:
@@ -108,17 +119,43 @@ def bounds_from_ids(ids: np.ndarray, where: str | Path) -> Bounds:
         Bounds(starts=array([0, 3]), lengths=array([3, 2]))
     """
     ids = np.asarray(ids).reshape(-1)
-    if not len(ids):
-        return Bounds(np.zeros(0, np.int64), np.zeros(0, np.int64))
-    starts = np.flatnonzero(np.concatenate([[True], ids[1:] != ids[:-1]]))
-    first_ids = ids[starts]
+    return _bounds(*runs(lambda start, stop: ids[start:stop], len(ids)), len(ids), where)
+
+
+def bounds_from_reader(read: Callable[[int, int], np.ndarray], rows: int, where: str | Path) -> Bounds:
+    """As :func:`bounds_from_ids`, for a column that is read in pieces.
+
+    Args:
+        read: ``read(start, stop)`` returns those rows of the column.
+        rows: N.
+        where: names the file in errors.
+
+    Raises:
+        ValueError: the rows of an episode are not next to each other.
+    """
+    return _bounds(*runs(read, rows), rows, where)
+
+
+def runs(read: Callable[[int, int], np.ndarray], rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where equal values begin, int64 [R], and these values [R], of a column that is read in pieces."""
+    starts, values, last = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], None
+    for start in range(0, rows, _PIECE_ROWS):
+        piece = np.asarray(read(start, min(start + _PIECE_ROWS, rows))).reshape(-1)
+        changed = np.concatenate([[last is None or piece[0] != last], piece[1:] != piece[:-1]])
+        starts.append(start + np.flatnonzero(changed))
+        values.append(piece[changed])
+        last = piece[-1]
+    return np.concatenate(starts), np.concatenate(values)
+
+
+def _bounds(starts: np.ndarray, first_ids: np.ndarray, rows: int, where: str | Path) -> Bounds:
     if len(np.unique(first_ids)) != len(first_ids):
         values, counts = np.unique(first_ids, return_counts=True)
         raise ValueError(
             f"{where}: the rows of episode {values[counts > 1][0]} are not next to each other: sort the file by "
             "episode and step first."
         )
-    return Bounds(starts, np.diff(np.append(starts, len(ids))))
+    return Bounds(starts, np.diff(np.append(starts, rows)))
 
 
 def check_steps(steps: np.ndarray, bounds: Bounds, where: str | Path) -> None:
@@ -140,6 +177,64 @@ def check_steps(steps: np.ndarray, bounds: Bounds, where: str | Path) -> None:
             f"{where}: row {row} holds step {int(steps[row])}, expected {int(expected[row])}: rows are missing or out "
             "of order; sort the file by episode and step, or export it again."
         )
+
+
+def brief(error: object, limit: int = 110) -> str:
+    """What another library says, in one line of at most ``limit`` characters."""
+    text = " ".join(str(error.args[0] if isinstance(error, KeyError) and error.args else error).split())
+    text = text or type(error).__name__
+    return text if len(text) <= limit else f"{text[: limit - 3]}..."
+
+
+def some(names: Sequence[str], most: int = 6) -> str:
+    """The first few of many names.
+
+    Examples:
+        >>> some(["a", "b", "c"], 2)
+        "'a', 'b' and 1 more"
+    """
+    first = ", ".join(repr(brief(name, 40)) for name in names[:most])
+    return f"{first} and {len(names) - most} more" if len(names) > most else first or "nothing"
+
+
+def is_foreign(error: BaseException) -> bool:
+    """Whether a library raised it about a file: a panic of a Rust library derives from BaseException."""
+    return isinstance(error, Exception) or type(error).__module__.startswith("pyo3")
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turns whatever a foreign library raises about a file into one ValueError that names the file.
+
+    Raises:
+        ValueError: anything but a missing package or file, and but an error that names the file already.
+    """
+    try:
+        yield
+    except (ImportError, FileNotFoundError, PermissionError):
+        raise
+    except BaseException as error:
+        ours = isinstance(error, (ValueError, KeyError)) and error.args and str(path) in str(error.args[0])
+        if ours or not is_foreign(error):
+            raise
+        what = "does not fit in memory" if isinstance(error, MemoryError) else brief(error)
+        raise ValueError(f"{path} cannot be read ({what}): it is damaged or incomplete, copy it again.") from error
+
+
+def check_inside(file: Path, folder: Path) -> None:
+    """Refuses what is no regular file, and links that lead out of the folder of the data set.
+
+    Raises:
+        ValueError: with the name of the file.
+    """
+    root = folder.resolve()
+    if root.parent.name == "snapshots" and (root.parent.parent / "blobs").is_dir():
+        root = root.parent.parent  # the download cache of Hugging Face keeps the files of a snapshot beside it
+    place = file.resolve()
+    if not place.is_relative_to(root):
+        raise ValueError(f"{file} is a link that leads out of {folder.name}: copy the data set with its files (cp -rL).")
+    if not place.is_file():
+        raise ValueError(f"{file} is no regular file: copy the data set again.")
 
 
 def require(module: str, package: str | None = None) -> ModuleType:

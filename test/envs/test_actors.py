@@ -78,7 +78,7 @@ def test_exceptions_arrive_with_their_words_and_the_object_lives_on(counters):
     before = counters.call("add", {0: (0,)})[0]
     with pytest.raises(KeyError, match="no such goal") as caught:
         counters.call("fail", {0: ("plain",), 1: ("plain",)})
-    assert "in fail" in caught.value.__notes__[0]  # the worker's traceback
+    assert "in fail" in str(caught.value.__cause__)  # the worker's traceback
     with pytest.raises(RuntimeError, match="ComplicatedError: arm and leg"):
         counters.call("fail", {1: ("complicated",)})
     with pytest.raises((AttributeError, RuntimeError), match="(?i)pickle"):
@@ -116,4 +116,20 @@ if __name__ == "__main__":
     assert outcome.returncode == -signal.SIGKILL, outcome.stderr
     pids = [int(word) for word in outcome.stdout.split()]
     assert len(pids) == 1
+    assert wait_until(lambda: all(map(gone, pids)))
+
+
+def test_a_stopped_worker_is_warned_of_and_given_up(monkeypatch):
+    """Without a limit the call would wait for ever; a stopped process leaves no sign of its own."""
+    monkeypatch.setattr("torchrl_ficreg.envs.actors._WARN_SECONDS", 0.2)
+    monkeypatch.setattr("torchrl_ficreg.envs.actors._JOIN_SECONDS", 0.2)
+    actors = Actors(Counter, 2, timeout=600.0)
+    assert actors.call("add", {0: (1,), 1: (1,)}) == {0: 1, 1: 1}
+    actors._timeout = 1.0
+    os.kill(actors.pids[1], signal.SIGSTOP)
+    pids = actors.pids
+    with pytest.warns(UserWarning, match=f"worker process 2 of 2.*{pids[1]}.*has not answered for 0 s"):
+        with pytest.raises(TimeoutError, match="has not answered for 1 s: look whether it is stopped"):
+            actors.call("add", {0: (1,), 1: (1,)})
+    assert actors.closed
     assert wait_until(lambda: all(map(gone, pids)))

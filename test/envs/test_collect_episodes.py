@@ -92,7 +92,7 @@ def test_what_a_worker_raises_is_raised_here_after_the_results_before_it():
     assert [next(results), next(results)] == [1, 4]
     with pytest.raises(ValueError, match="-3 is negative") as caught:
         next(results)
-    assert "negative_fails" in caught.value.__notes__[0]
+    assert "negative_fails" in str(caught.value.__cause__)
 
 
 def test_a_worker_that_dies_is_reported():

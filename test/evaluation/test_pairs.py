@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
@@ -151,3 +152,50 @@ def test_frozen_pairs_of_another_draw_or_dataset_are_refused(tmp_path):
             StartGoalPairs.frozen(path, make_dataset(), **{**DRAW, **change})
     with pytest.raises(ValueError, match="another draw or dataset"):
         StartGoalPairs.frozen(path, make_dataset(seed=1), **DRAW)
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"goal_offset": "x"}, TypeError),
+        ({"goal_offset": True}, TypeError),
+        ({"goal_offset": 0}, ValueError),
+        ({"seed": {}}, TypeError),
+        ({"seed": -1}, ValueError),
+        ({"env": None}, TypeError),
+        ({"fingerprint": 3}, TypeError),
+        ({"episode": np.zeros(0, int), "step": np.zeros(0, int), "start_state": np.zeros((0, 2))}, ValueError),
+        ({"episode": np.array([0.5, 1.0])}, TypeError),
+        ({"episode": np.array([-1, 0])}, ValueError),
+        ({"step": np.array([1])}, ValueError),
+        ({"start_state": np.zeros((3, 2))}, ValueError),
+        ({"start_state": np.zeros((1, 2))}, ValueError),
+        ({"goal_state": np.zeros((2, 3))}, ValueError),
+        ({"goal_state": np.array([[0.0, np.nan], [0.0, 0.0]])}, ValueError),
+        ({"start_state": np.array([["a", "b"], ["c", "d"]])}, TypeError),
+        ({"start_state": np.zeros((2, 0)), "goal_state": np.zeros((2, 0))}, ValueError),
+    ],
+)
+def test_fields_that_do_not_fit_together_are_refused_also_with_a_hash_that_fits(tmp_path, change, error):
+    """A manifest is data from elsewhere: its hash says that nothing changed, not that it makes sense."""
+    pairs = same_room_pairs(2)
+    with pytest.raises(error):
+        replace(pairs, **change)
+    content = {**pairs._content(), **{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in change.items()}}
+    text = json.dumps(content, sort_keys=True)
+    path = tmp_path / "pairs.json"
+    path.write_text(json.dumps({**content, "hash": hashlib.sha256(text.encode()).hexdigest()}))
+    with pytest.raises(ValueError, match="is not a manifest of start-goal pairs"):
+        StartGoalPairs.load(path)
+
+
+def test_a_manifest_is_not_written_through_a_link_and_a_failure_leaves_nothing(tmp_path):
+    elsewhere, path = tmp_path / "elsewhere", tmp_path / "pairs.json"
+    elsewhere.write_text("mine")
+    path.symlink_to(elsewhere)
+    same_room_pairs().save(path)
+    assert elsewhere.read_text() == "mine" and not path.is_symlink()
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError):
+        same_room_pairs().save(tmp_path / "folder")  # cannot be replaced by a file
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["elsewhere", "folder", "pairs.json"]

@@ -17,15 +17,23 @@ import traceback
 import weakref
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
 import torch
 
-from torchrl_ficreg.envs.process_env import environment_variables, ONE_THREAD
+from torchrl_ficreg.envs.process_env import (
+    environment_variables,
+    ONE_THREAD,
+    out_of_handles,
+    wait_patiently,
+    without_interrupts,
+    WorkerTraceback,
+)
 
 _JOIN_SECONDS = 5.0
+_WARN_SECONDS = 30.0  # without any answer
 
 
 class Actors:
@@ -34,23 +42,33 @@ class Actors:
     Args:
         make: picklable, takes no argument; builds the object, whose ``close`` method is called at the end.
         count: W.
+        timeout: seconds after which a call that no worker answers is given up; a warning comes after 30 s.
+
+    Raises:
+        RuntimeError: too many open files.
     """
 
-    def __init__(self, make: Callable[[], Any], count: int) -> None:
+    def __init__(self, make: Callable[[], Any], count: int, *, timeout: float = 1800.0) -> None:
+        self._timeout = timeout
         context = multiprocessing.get_context("spawn")  # a forked child would inherit torch's threads half-alive
         self._workers: list[tuple[Connection, BaseProcess]] = []
         self._shut_down = weakref.finalize(self, _shut_down, self._workers)  # also at exit, or if closing is forgotten
         try:
-            with environment_variables(ONE_THREAD):
+            with environment_variables(ONE_THREAD), without_interrupts():
                 for _ in range(count):
                     ours, theirs = context.Pipe()
                     process = context.Process(target=_work, args=(make, theirs), daemon=True)
                     process.start()
                     theirs.close()  # else a dead worker's pipe would look open
                     self._workers.append((ours, process))
-        except BaseException:
+        except BaseException as error:
             self.close()
+            if (reason := out_of_handles(error)) is not None:
+                raise reason from error
             raise
+
+    def __reduce__(self) -> str:
+        raise TypeError("worker processes can be neither copied nor pickled: start new ones.")
 
     @property
     def closed(self) -> bool:
@@ -73,8 +91,9 @@ class Actors:
             what it returned, by worker.
 
         Raises:
-            Exception: what the method raised in the first worker where it did, with the worker's traceback as a note;
-                the processes live on.
+            Exception: what the method raised in the first worker where it did, with the worker's traceback as its
+                cause; the processes live on.
+            TimeoutError: no answer in time. All processes have ended then.
             RuntimeError: a worker died, now or before, or the processes were closed. All of them have ended then, as
                 after an interruption (Ctrl-C).
         """
@@ -89,7 +108,7 @@ class Actors:
             raise
         for answer in answers.values():
             if isinstance(answer, _Failure):
-                raise answer.error
+                raise (out_of_handles(answer.error) or answer.error) from WorkerTraceback(answer.traceback)
         return answers
 
     def close(self) -> None:
@@ -99,8 +118,8 @@ class Actors:
     def _send(self, worker: int, message: Any) -> None:
         try:
             self._workers[worker][0].send(message)
-        except OSError as error:
-            raise self._death(worker) from error
+        except (OSError, RuntimeError) as error:  # torch's sharing of tensors raises both
+            raise (out_of_handles(error) or self._death(worker)) from error
 
     def _receive_all(self, workers: Iterable[int]) -> dict[int, Any]:
         """One answer of each, in whatever order they come: a death is seen while others are still busy."""
@@ -109,10 +128,18 @@ class Actors:
         while missing:
             # The sentinel too: another process, forked from this one, may hold a dead worker's pipe open.
             signs = {sign: w for w in missing for sign in (self._workers[w][0], self._workers[w][1].sentinel)}
-            for worker in {signs[sign] for sign in wait(list(signs))}:
+            for worker in {signs[sign] for sign in self._wait(signs)}:
                 answers[worker] = self._receive(worker)
                 missing.remove(worker)
         return answers
+
+    def _wait(self, signs: dict[Any, int]) -> list[Any]:
+        def names() -> str:
+            late = sorted(set(signs.values()))
+            pids = ", ".join(str(self._workers[worker][1].pid) for worker in late[:4])
+            return f"worker process {late[0] + 1} of {len(self._workers)} (pids waited for: {pids})"
+
+        return wait_patiently(signs, names, warn_after=_WARN_SECONDS, timeout=self._timeout)
 
     def _receive(self, worker: int) -> Any:
         connection = self._workers[worker][0]
@@ -120,12 +147,17 @@ class Actors:
             if connection.poll():
                 return pickle.loads(connection.recv_bytes())
         except (EOFError, OSError) as error:
-            raise self._death(worker) from error
+            raise (out_of_handles(error) or self._death(worker)) from error
         raise self._death(worker)
 
     def _death(self, worker: int) -> RuntimeError:
         process = self._workers[worker][1]
         process.join(_JOIN_SECONDS)
+        if process.is_alive():
+            return RuntimeError(
+                f"worker process {worker + 1} of {len(self._workers)} (pid {process.pid}) lives, but its pipe is broken: "
+                "start anew."
+            )
         return RuntimeError(
             f"worker process {worker + 1} of {len(self._workers)} died with exit code {process.exitcode}: look for its "
             "last words on stderr (negative: the signal that killed it, -9 often for want of memory; 1 at start: the "
@@ -148,6 +180,7 @@ class _Failure:
     """An exception on its way from a worker."""
 
     error: Exception
+    traceback: str = ""
 
 
 def _work(make: Callable[[], Any], connection: Connection) -> None:
@@ -166,15 +199,14 @@ def _answer(actor: Any, message: bytes) -> bytes:
         method, arguments = pickle.loads(message)
         return pickle.dumps(getattr(actor, method)(*arguments))  # by value: torch's own pickling shares memory
     except Exception as error:
-        error.add_note(f"raised in a worker process:\n{traceback.format_exc()}")
-        return _pack(error)
+        return _pack(error, f"raised in a worker process:\n{traceback.format_exc()}")
 
 
-def _pack(error: Exception) -> bytes:
+def _pack(error: Exception, words: str) -> bytes:
     """The exception itself where it survives the journey, else its words."""
     try:
-        packed = pickle.dumps(_Failure(error))
+        packed = pickle.dumps(_Failure(error, words))
         pickle.loads(packed)
     except Exception:
-        return pickle.dumps(_Failure(RuntimeError(f"{type(error).__name__}: {error}")))
+        return pickle.dumps(_Failure(RuntimeError(f"{type(error).__name__}: {error}"), words))
     return packed

@@ -16,6 +16,7 @@ from gymnasium import spaces
 from torchrl_ficreg.data.schema import GOAL_PIXELS, PIXELS, STATE, SUCCESS
 
 GOAL_STATE = "goal_state"
+_LARGEST_ACTION = 100.0  # a hundred times what all environments ask for; physics would leave their states beyond
 
 
 class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
@@ -56,7 +57,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         terminate_on_success: bool = True,
         render_mode: str | None = "rgb_array",
     ) -> None:
-        if not isinstance(image_size, int) or image_size < 1:
+        if not isinstance(image_size, int) or isinstance(image_size, bool) or image_size < 1:
             raise ValueError(f"image_size must be a positive integer, got {image_size!r}.")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}.")
@@ -147,13 +148,13 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         """Takes one action.
 
         Args:
-            action: [A], finite; what happens beyond the bounds is the physics' business.
+            action: [A], finite and within +-100; what happens beyond the bounds is the physics' business.
 
         Returns:
             observation, reward, terminated, truncated (always False) and info, see the class.
 
         Raises:
-            ValueError: a wrong shape or a value that is not finite.
+            ValueError: a wrong shape, or a value that is not finite or beyond +-100.
             gymnasium.error.ResetNeeded: no episode was started.
         """
         if self._goal_state is None:
@@ -163,6 +164,11 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
             raise ValueError(f"action must be {self.action_space.shape}, got {action.shape}: step takes one action.")
         if not np.isfinite(action).all():
             raise ValueError(f"action must be finite, got {action.tolist()}: look for the NaN in the policy.")
+        if np.abs(action).max() > _LARGEST_ACTION:
+            raise ValueError(
+                f"action must be within +-{_LARGEST_ACTION:.0f}, got {action.tolist()}: the bounds are "
+                f"{self.action_space.low.tolist()} to {self.action_space.high.tolist()}, in environment units."
+            )
         self._step_physics(action)
         success = self._is_success(self._get_state(), self._goal_state)
         terminated = success and self.terminate_on_success

@@ -21,6 +21,7 @@ from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
 from torchrl_ficreg.envs.actors import Actors
+from torchrl_ficreg.envs.process_env import out_of_handles
 
 
 class WorkerGroupsEnv(EnvBase):
@@ -34,20 +35,25 @@ class WorkerGroupsEnv(EnvBase):
         num_envs: N.
         create: picklable; builds one environment without batch dimension and without nested keys.
         num_workers: W; the sizes of the groups differ by at most one.
+        timeout: seconds after which a call that no worker answers is given up; a warning comes after 30 s.
 
     Raises:
         ValueError: W is not in 1..N.
         Exception: what ``create`` raised.
-        RuntimeError: a worker process died.
+        RuntimeError: a worker process died, too many files are open, or there is too little shared memory.
+        TimeoutError: no worker answered in time; the batch is closed then.
+        TypeError: it is copied or pickled.
     """
 
-    def __init__(self, num_envs: int, create: Callable[[], EnvBase], num_workers: int) -> None:
+    def __init__(
+        self, num_envs: int, create: Callable[[], EnvBase], num_workers: int, *, timeout: float = 1800.0
+    ) -> None:
         if not 1 <= num_workers <= num_envs:
             raise ValueError(f"num_workers must be in 1..num_envs ({num_envs}), got {num_workers}.")
         super().__init__(batch_size=[num_envs])
         edges = [num_envs * worker // num_workers for worker in range(num_workers + 1)]
         self._groups = [range(*pair) for pair in zip(edges, edges[1:])]
-        self._actors = Actors(_Group, num_workers)
+        self._actors = Actors(_Group, num_workers, timeout=timeout)
         self.is_closed = False
         try:
             specs = self._actors.call("create", {w: (create, len(group)) for w, group in enumerate(self._groups)})
@@ -73,7 +79,20 @@ class WorkerGroupsEnv(EnvBase):
         self._step_names = [*self._reset_names, *specs.reward.keys()]
         parts = (self.observation_spec, self.full_action_spec, self.full_reward_spec, self.full_done_spec)
         zeros = {name: leaf for part in parts for name, leaf in part.zero().items()}
-        self._rows = {name: leaf.contiguous().share_memory_() for name, leaf in zeros.items()}  # each [N, ...]
+        try:
+            self._rows = {name: leaf.contiguous().share_memory_() for name, leaf in zeros.items()}  # each [N, ...]
+        except (OSError, RuntimeError) as error:
+            needed = sum(leaf.numel() * leaf.element_size() for leaf in zeros.values()) / 2**20
+            raise out_of_handles(error) or RuntimeError(
+                f"no {needed:.1f} MiB of shared memory for {self.numel()} environments ({str(error)[:80]}): enlarge "
+                "/dev/shm (docker run --shm-size=1g), take smaller pictures, or num_workers=None."
+            ) from error
+
+    def __reduce_ex__(self, protocol: int) -> str:
+        raise TypeError(
+            "a batch in worker processes can be neither copied nor pickled: build another one by make_env and reset it "
+            "to the states, or leave num_workers at None."
+        )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         per_env = kwargs.pop("list_of_kwargs", None) or [{}] * self.numel()

@@ -28,6 +28,7 @@ from torchrl.envs import EnvBase
 from torchrl_ficreg.data.schema import ACTION, DONE, EPISODE, PIXELS, STATE, SUCCESS
 from torchrl_ficreg.envs.base import GOAL_STATE
 from torchrl_ficreg.envs.collect import EpisodeRecorder
+from torchrl_ficreg.envs.process_env import without_interrupts
 
 CollectorKind = Literal["async", "ray", "submitit"]
 EXPERT_ACTION, SHARD, AT_GOAL = "expert_action", "shard", "at_goal"
@@ -135,7 +136,8 @@ def collect_shards(
     if not left:
         return
     create = [functools.partial(ExpertEpisodesEnv, recorder, shares[shard], shard) for shard in left]
-    collector = _make_collector(kind, create, options or {})
+    with without_interrupts():
+        collector = _make_collector(kind, create, options or {})
     begun: dict[int, list[TensorDictBase]] = {shard: [] for shard in left}
     try:
         for batch in collector:

@@ -95,6 +95,10 @@ def make_env(
         >>> env.rollout(3, break_when_any_done=False)["pixels"].shape
         torch.Size([2, 3, 3, 64, 64])
     """
+    counts = {"num_envs": num_envs, "num_workers": num_workers, "seed": seed, "max_episode_steps": max_episode_steps}
+    for word, value in counts.items():
+        if (value is not None or word == "num_envs") and (not isinstance(value, int) or isinstance(value, bool)):
+            raise ValueError(f"{word} must be an integer, got {value!r}.")
     if num_envs < 1:
         raise ValueError(f"num_envs must be at least 1, got {num_envs}.")
     if num_workers is not None and not 1 <= num_workers <= num_envs:

@@ -32,6 +32,7 @@ _OFF = "off"  # MuJoCo's word for no pictures at all
 _ON = ("", "1", "on", "true", "enable", "enabled", "glx")  # its words for a window, which GLFW makes
 _BACKENDS = ("egl", "osmesa", "glfw", "cgl")
 _MAX_GEOMS = 2000  # of a scene, decorations included
+_process: int | None = None  # that opened GL
 _PROBE = """
 import mujoco
 model = mujoco.MjModel.from_xml_string("<mujoco/>")
@@ -122,6 +123,18 @@ def _probe(backend: str) -> bool:
     return child.returncode == 0
 
 
+class MujocoHolder:
+    """Copies and pickles of an object that keeps MuJoCo's module, under ``_mujoco``."""
+
+    _mujoco: ModuleType
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_mujoco"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _mujoco=import_mujoco())
+
+
 class OffscreenRenderer:
     """Draws square pictures of one MuJoCo model into arrays; opens GL at the first of them.
 
@@ -144,7 +157,7 @@ class OffscreenRenderer:
     """
 
     def __init__(self, model: mujoco.MjModel, size: int) -> None:
-        if not isinstance(size, int) or size < 1:
+        if not isinstance(size, int) or isinstance(size, bool) or size < 1:
             raise ValueError(f"size must be a positive integer, got {size!r}.")
         self._mujoco = import_mujoco()
         self._model = model
@@ -154,6 +167,10 @@ class OffscreenRenderer:
         self._rectangle = self._mujoco.MjrRect(0, 0, size, size)
         self._buffer = np.empty((size, size, 3), np.uint8)
         self._surface: _Surface | None = None
+
+    def __reduce__(self) -> tuple[type, tuple[Any, int]]:
+        """A copy opens GL of its own."""
+        return type(self), (self._model, self._size)
 
     def draw(
         self,
@@ -173,9 +190,11 @@ class OffscreenRenderer:
 
         Raises:
             ValueError: no such camera.
-            RuntimeError: GL is missing or refuses; the message names the packages to install.
+            RuntimeError: GL is missing or refuses; the message names the packages to install. Or this process was
+                forked from one that had drawn, in which GL would wait for ever.
         """
         mujoco = self._mujoco
+        _refuse_fork()
         if self._surface is None:
             self._surface = _Surface(self._model, self._size)
         option = self._option if scene_option is None else scene_option
@@ -217,6 +236,8 @@ class _Surface:
     """
 
     def __init__(self, model: mujoco.MjModel, size: int) -> None:
+        global _process
+        _process = os.getpid()
         self._mujoco = import_mujoco()
         backend = _backend()
         self._gl = None
@@ -246,7 +267,22 @@ class _Surface:
         self._release()
 
 
+def _was_forked() -> bool:
+    """Whether GL was opened by the process that this one was forked from."""
+    return _process not in (None, os.getpid())
+
+
+def _refuse_fork() -> None:
+    if _was_forked():
+        raise RuntimeError(
+            "this process was forked after its parent had drawn, and GL does not survive a fork: start processes by "
+            "multiprocessing.get_context('spawn'), or fork before the first picture."
+        )
+
+
 def _release(gl: Any, context: Any) -> None:
+    if _was_forked():  # they belong to the parent
+        return
     try:
         # MuJoCo deletes by numbers that mean something else in another context: its own has to be the current one.
         gl.make_current()
@@ -268,6 +304,8 @@ def _context_class(backend: str) -> type:
         _context = None  # read by free(), even when the constructor has failed
 
         def free(self) -> None:
+            if _was_forked():
+                return
             try:
                 super().free()
             except Exception:  # ended by another user of the same library: nothing is left to free

@@ -15,23 +15,31 @@ import multiprocessing
 import signal
 import traceback
 from collections.abc import Callable, Iterable, Iterator
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 import torch
 
-from torchrl_ficreg.envs.process_env import environment_variables, ONE_THREAD
+from torchrl_ficreg.envs.process_env import (
+    environment_variables,
+    ONE_THREAD,
+    out_of_handles,
+    wait_patiently,
+    without_interrupts,
+    WorkerTraceback,
+)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _ITEMS_PER_WORKER = 2  # one under work and one waiting, so that a worker never idles for want of an item
 _JOIN_SECONDS = 5.0
+_WARN_SECONDS = 300.0  # without any result; an episode of pictures takes a while
 
 
 def ordered_map(
-    function: Callable[[Item], Result], items: Iterable[Item], *, num_workers: int
+    function: Callable[[Item], Result], items: Iterable[Item], *, num_workers: int, timeout: float = 7200.0
 ) -> Iterator[Result]:
     """Maps a function over items in worker processes and yields the results in the order of the items.
 
@@ -40,30 +48,38 @@ def ordered_map(
         items: picklable and small (a result may wait in the pipe while one is sent); drawn as results are consumed,
             never more than ``2 * num_workers`` ahead.
         num_workers: number of processes, at least 1.
+        timeout: seconds without any result after which it gives up; a warning comes after 300 s.
 
     Yields:
         ``function(item)`` for each item.
 
     Raises:
-        Exception: what the function raised, with the worker's traceback as a note.
-        RuntimeError: a worker process died.
+        Exception: what the function raised, with the worker's traceback as its cause.
+        RuntimeError: a worker process died, or too many files are open.
+        TimeoutError: no result in time.
     """
     context = multiprocessing.get_context("spawn")  # a forked child would inherit torch's threads half-alive
     workers: dict[Connection, BaseProcess] = {}
     try:
-        with environment_variables(ONE_THREAD):
+        with environment_variables(ONE_THREAD), without_interrupts():
             for _ in range(num_workers):
                 ours, theirs = context.Pipe()
                 process = context.Process(target=_work, args=(function, theirs), daemon=True)
                 process.start()
                 theirs.close()  # else a dead worker's pipe would look open
                 workers[ours] = process
-        yield from _exchange(workers, enumerate(items))
+        yield from _exchange(workers, enumerate(items), timeout)
+    except OSError as error:
+        if (reason := out_of_handles(error)) is not None:
+            raise reason from error
+        raise
     finally:
         _shut_down(workers)
 
 
-def _exchange(workers: dict[Connection, BaseProcess], tasks: Iterator[tuple[int, Any]]) -> Iterator[Any]:
+def _exchange(
+    workers: dict[Connection, BaseProcess], tasks: Iterator[tuple[int, Any]], timeout: float
+) -> Iterator[Any]:
     load = dict.fromkeys(workers, 0)
     owner: dict[int, Connection] = {}
     ready: dict[int, Any] = {}
@@ -85,13 +101,17 @@ def _exchange(workers: dict[Connection, BaseProcess], tasks: Iterator[tuple[int,
         if position in ready:
             result = ready.pop(position)
             if isinstance(result, _Failure):
-                raise result.error  # only now: what comes before it has been delivered
+                raise result.error from WorkerTraceback(result.traceback)  # only now: what comes before it has been delivered
             yield result
             position += 1
             continue
         if not owner:
             return
-        for connection in wait(list(set(owner.values()))):
+        busy = set(owner.values())
+        pids = ", ".join(str(workers[connection].pid) for connection in busy)
+        for connection in wait_patiently(
+            busy, lambda: f"the group of worker processes {pids}", warn_after=_WARN_SECONDS, timeout=timeout
+        ):
             index, result = _receive(connection, workers)
             del owner[index]
             load[connection] -= 1
@@ -133,8 +153,8 @@ def _shut_down(workers: dict[Connection, BaseProcess]) -> None:
 class _Failure:
     """An exception on its way from a worker."""
 
-    def __init__(self, error: Exception) -> None:
-        self.error = error
+    def __init__(self, error: Exception, traceback: str = "") -> None:
+        self.error, self.traceback = error, traceback
 
 
 def _work(function: Callable[[Any], Any], connection: Connection) -> None:
@@ -151,12 +171,11 @@ def _work(function: Callable[[Any], Any], connection: Connection) -> None:
                 raise
             except Exception as error:  # not picklable, be it a result or an exception
                 words = result.error if isinstance(result, _Failure) else error
-                connection.send((index, _Failure(RuntimeError(f"{type(words).__name__}: {words}"))))
+                connection.send((index, _Failure(RuntimeError(f"{type(words).__name__}: {words}"), getattr(result, "traceback", ""))))
 
 
 def _call(function: Callable[[Any], Any], item: Any) -> Any:
     try:
         return function(item)
     except Exception as error:
-        error.add_note(f"raised in a worker process at item {item!r}:\n{traceback.format_exc()}")
-        return _Failure(error)
+        return _Failure(error, f"raised in a worker process at item {item!r}:\n{traceback.format_exc()}")

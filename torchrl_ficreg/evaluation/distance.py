@@ -45,7 +45,9 @@ class DistanceProfile:
         return center, spread
 
     def summary(self) -> dict[str, Any]:
-        """Plain JSON values."""
+        """Plain JSON values; None for what is not finite."""
+        if not (np.isfinite(self.true).all() and np.isfinite(self.latent).all()):
+            return {"rank_correlation": None, "true_distance": [], "median_latent_distance": []}
         center, spread = self.bins()
         return {
             "rank_correlation": self.rank_correlation,
@@ -65,10 +67,16 @@ def latent_distance(
         dataset: held-out episodes.
         num_frames: frames drawn, at most all there are.
         seed: of the draw.
+
+    Raises:
+        ValueError: fewer than two frames.
     """
+    dataset.require_state()
     table = dataset.episodes
     ends = table["length"].cumsum(0)
-    total = int(ends[-1])
+    total = int(ends[-1]) if len(ends) else 0
+    if min(num_frames, total) < 2:
+        raise ValueError(f"distances need two frames at least, got num_frames={num_frames} of {total} held-out ones.")
     picks = np.sort(np.random.default_rng(seed).choice(total, min(num_frames, total), replace=False))
     rows = torch.searchsorted(ends, torch.from_numpy(picks), right=True)
     steps = torch.from_numpy(picks) - (ends - table["length"])[rows]

@@ -139,6 +139,9 @@ def evaluate_mpc(
         ValueError: ``budget`` or ``num_envs`` below 1, ``num_workers`` too, ``env_kwargs`` that are set here, or a
             planner that imagines further ahead than ``budget`` steps.
     """
+    for name, value in (("budget", budget), ("num_envs", num_envs), ("record", record)):
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise ValueError(f"{name} must be an integer, got {value!r}.")
     if budget < 1 or num_envs < 1:
         raise ValueError(f"budget and num_envs must be positive, got {budget} and {num_envs}.")
     if num_workers is not None and num_workers < 1:

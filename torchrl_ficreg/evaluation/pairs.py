@@ -27,6 +27,10 @@ class StartGoalPairs:
         fingerprint: of the dataset they were drawn from.
         episode, step: [N], where each start was found.
         start_state, goal_state: [N, S] float64, full simulator states.
+
+    Raises:
+        TypeError: a field of another type.
+        ValueError: no pairs, arrays of other shapes, negative numbers, or states that are not finite.
     """
 
     env: str
@@ -37,6 +41,35 @@ class StartGoalPairs:
     step: np.ndarray
     start_state: np.ndarray
     goal_state: np.ndarray
+
+    def __post_init__(self) -> None:
+        kinds = {"env": str, "fingerprint": str, "goal_offset": int, "seed": int}
+        for name, kind in kinds.items():
+            value = getattr(self, name)
+            if not isinstance(value, kind) or isinstance(value, bool):
+                raise TypeError(f"{name} of start-goal pairs must be of type {kind.__name__}, got {str(value)[:40]!r}.")
+        if self.goal_offset < 1 or self.seed < 0:
+            raise ValueError(
+                f"goal_offset must be positive and seed not negative, got {self.goal_offset} and {self.seed}."
+            )
+        arrays = {"episode": "iu", "step": "iu", "start_state": "iuf", "goal_state": "iuf"}
+        for name, dtypes in arrays.items():
+            value = getattr(self, name)
+            if not isinstance(value, np.ndarray) or value.dtype.kind not in dtypes:
+                raise TypeError(f"{name} of start-goal pairs must be an array of numbers, got {str(value)[:40]!r}.")
+        shapes = {name: getattr(self, name).shape for name in arrays}
+        count, states = shapes["episode"], shapes["start_state"]
+        if len(count) != 1 or not count[0] or shapes["step"] != count or len(states) != 2 or states[:1] != count or (
+            not states[1] or shapes["goal_state"] != states
+        ):
+            raise ValueError(
+                "start-goal pairs must be episode and step [N], N >= 1, and start_state and goal_state [N, S], got "
+                f"{', '.join(f'{name} {list(shape)}' for name, shape in shapes.items())}."
+            )
+        if min(self.episode.min(), self.step.min()) < 0:
+            raise ValueError("episode and step of start-goal pairs must not be negative.")
+        if not (np.isfinite(self.start_state).all() and np.isfinite(self.goal_state).all()):
+            raise ValueError("start_state and goal_state of start-goal pairs must be finite.")
 
     def __len__(self) -> int:
         return len(self.episode)
@@ -60,6 +93,7 @@ class StartGoalPairs:
         Raises:
             ValueError: fewer than N legal starts.
         """
+        dataset.require_state()
         table = dataset.episodes
         starts = (table["length"] - goal_offset).clamp_min(0).numpy()  # legal starts of each episode
         total = int(starts.sum())
@@ -102,11 +136,20 @@ class StartGoalPairs:
         return pairs
 
     def save(self, path: Path) -> None:
-        """Writes the manifest in one piece, also where several runs write the same one at once."""
+        """Writes the manifest in one piece, also where several runs write the same one at once.
+
+        A link in its place is replaced, not followed.
+        """
+        path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
-        part.write_text(json.dumps({**self._content(), "hash": self.hash}, indent=1))
-        os.replace(part, path)
+        try:
+            with open(part, "x") as file:  # never through a link
+                json.dump({**self._content(), "hash": self.hash}, file, indent=1)
+            os.replace(part, path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
 
     @classmethod
     def load(cls, path: Path) -> StartGoalPairs:

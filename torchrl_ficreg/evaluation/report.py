@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 
+from torchrl_ficreg._utils import write_atomic
 from torchrl_ficreg.evaluation.distance import DistanceProfile
 from torchrl_ficreg.evaluation.mpc import Evaluation
 
@@ -110,7 +112,8 @@ def save_episodes_gif(evaluation: Evaluation, target: Path, *, scale: int = 2, f
         rows = [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)]
         pictures.append(np.concatenate(rows))
     pictures += [pictures[-1]] * fps  # a second to look at the end
-    imageio.imwrite(target, np.stack(pictures), duration=1000 // fps, loop=0)
+    movie = imageio.imwrite("<bytes>", np.stack(pictures), extension=".gif", duration=1000 // fps, loop=0)
+    write_atomic(target, movie)
 
 
 def _tile(frame: np.ndarray, goal: np.ndarray, reached: bool, scale: int) -> np.ndarray:
@@ -125,5 +128,7 @@ def _tile(frame: np.ndarray, goal: np.ndarray, reached: bool, scale: int) -> np.
 
 def _save(figure, target: Path) -> None:
     figure.tight_layout()
-    figure.savefig(target, dpi=120)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=120)
     _pyplot().close(figure)
+    write_atomic(target, drawn.getvalue())

@@ -125,10 +125,11 @@ class GoalPolicy(TensorDictModule):
         self._check_context(latent, past_action, goal, horizon, bounds)
         # Planners may keep the predictor in another precision.
         history, dtype = world_model.history, next(world_model.predictor.parameters(), latent).dtype
+        own = next(self.module.parameters()).dtype
         seen, done = latent[..., -history:, :], past_action[..., max(0, past_action.shape[-2] - history + 1) :, :]
         plan: list[torch.Tensor] = []
         while True:
-            block = self.module(seen[..., -1, :], goal).to(latent.dtype)  # [..., F * A]
+            block = self.module(seen[..., -1, :].to(own), goal.to(own)).to(latent.dtype)  # [..., F * A]
             block = block if bounds is None else block.clamp(*bounds)
             plan.append(block)
             if len(plan) == horizon:

@@ -86,6 +86,13 @@ class CubeArm:
         self.ogbench._data = self._data
         self.ogbench._ik = type(template._ik)(model=template._ik._model, sites=["attachment_site"])
 
+    def __getstate__(self) -> np.ndarray:
+        return self.state  # which decides, with the action, about every further step
+
+    def __setstate__(self, state: np.ndarray) -> None:
+        self.__init__()
+        self.restore(state)
+
     @property
     def state(self) -> np.ndarray:
         """The present state, a new [41] float64."""

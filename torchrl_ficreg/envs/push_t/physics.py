@@ -6,6 +6,7 @@ See :mod:`torchrl_ficreg.envs.push_t.shapes` for lengths and axes. Times are in 
 from __future__ import annotations
 
 import weakref
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +37,9 @@ TIME_STEP, SUBSTEPS = 0.01, 10  # s, and how many of them make an environment st
 class PushTWorld:
     """A restorable simulation: the same state and actions give the same bits, whatever happened before.
 
+    A copy or an unpickled world repeats what was done since the last restoration, so that it also has the contacts that
+    the solver remembers and goes on with the same bits.
+
     The disc is kinematic: it pushes the block, nothing pushes it, and walls do not stop it. Space has no friction and
     a damping that stills the block between two contacts.
 
@@ -56,12 +60,23 @@ class PushTWorld:
     def __init__(self, *, relative: bool = True) -> None:
         self.relative = relative
         self._state = np.zeros(STATE_SIZE)
+        self._journal: list[tuple[str, np.ndarray]] = []  # calls since the space was built, with their argument
         self._build()
         # pymunk frees a space by Python code, which fails loudly in an interpreter that is being torn down: a world
         # still alive at exit lets go of its space before that.
         weakref.finalize(self, vars(self).clear)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A pymunk space copies neither the centre of gravity nor the solver's memory faithfully.
+        return {"relative": self.relative, "journal": self._journal}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(relative=state["relative"])
+        for method, argument in state["journal"]:
+            getattr(self, method)(argument)
+
     def _build(self) -> None:
+        self._journal.clear()
         # Contacts cached by the solver and the order of its collision pairs are hidden state that pymunk cannot
         # clear: a new space (0.1 ms) is the only restoration that is exact.
         self.space = pymunk.Space()
@@ -81,6 +96,7 @@ class PushTWorld:
     def set_state(self, state: np.ndarray) -> None:
         """Restores a state [7] without a physics step."""
         self._build()
+        self._journal.append(("set_state", state.copy()))
         self._place(state)
         self._state = state.copy()
 
@@ -89,6 +105,7 @@ class PushTWorld:
 
         The agent is carried on by its velocity, and what overlapped before the restoration pushes the block after it.
         """
+        self._journal.append(("restore_legacy", state.copy()))
         self._place(state)
         self.space.step(TIME_STEP)
         self._read()
@@ -110,7 +127,9 @@ class PushTWorld:
         Args:
             action: [2] float64, not clipped.
         """
-        target = np.asarray(action, dtype=np.float64) * ACTION_SCALE + self._state[:2] if self.relative else action
+        action = np.array(action, dtype=np.float64)
+        self._journal.append(("step", action))
+        target = action * ACTION_SCALE + self._state[:2] if self.relative else action
         target_x, target_y = float(target[0]), float(target[1])
         agent = self.agent
         for _ in range(SUBSTEPS):

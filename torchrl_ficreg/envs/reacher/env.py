@@ -8,13 +8,13 @@ import numpy as np
 from gymnasium import spaces
 
 from torchrl_ficreg.envs.base import GoalEnv
-from torchrl_ficreg.envs.gl import OffscreenRenderer, import_mujoco
+from torchrl_ficreg.envs.gl import MujocoHolder, OffscreenRenderer, import_mujoco
 from torchrl_ficreg.envs.reacher import physics
 
 _LARGEST = 1e4  # of all angles and velocities, far beyond what the motors can do
 
 
-class ReacherEnv(GoalEnv):
+class ReacherEnv(MujocoHolder, GoalEnv):
     """Turn the two joints of a planar arm by their motors until both angles are those of the goal.
 
     State: shoulder and wrist in rad, then their velocities in rad/s, [4] float64; the shoulder winds without limit.
@@ -51,7 +51,7 @@ class ReacherEnv(GoalEnv):
     def __init__(
         self, *, wrap: bool = True, stop_within_action: bool = True, shadow_size: int = 2048, **kwargs: Any
     ) -> None:
-        if not isinstance(shadow_size, int) or shadow_size < 1:
+        if not isinstance(shadow_size, int) or isinstance(shadow_size, bool) or shadow_size < 1:
             raise ValueError(f"shadow_size must be a positive integer, got {shadow_size!r}.")
         self.wrap = wrap
         self.stop_within_action = stop_within_action

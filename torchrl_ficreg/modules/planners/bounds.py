@@ -1,4 +1,4 @@
-"""Bounds of a raw action, and of a z-scored action block."""
+"""Bounds of a raw action, and of a z-scored action block; components that are held at one value."""
 
 from __future__ import annotations
 
@@ -16,27 +16,34 @@ def check_bounds(world_model: LatentWorldModel, bounds: tuple[Sequence[float], S
 
     Args:
         world_model: its statistics have A dimensions.
-        bounds: (low [A], high [A]).
+        bounds: (low [A], high [A]); equal where a component never changes.
 
     Returns:
         (low [A], high [A]), float32, on the CPU.
 
     Raises:
-        ValueError: another shape, a low that is not below its high, or statistics that no actions in between have.
+        ValueError: another shape, a low above its high, or statistics that no actions in between have.
     """
     try:
         low, high = (torch.as_tensor(bound, dtype=torch.float32).cpu() for bound in bounds)
     except (TypeError, ValueError) as error:
         raise ValueError(f"action_bounds must be (low, high) in environment units, got {bounds!r}.") from error
     shape = world_model.action_mean.shape
-    if low.shape != shape or high.shape != shape or not (low < high).all():
+    if low.shape != shape or high.shape != shape or not (low <= high).all():
         raise ValueError(
-            f"action_bounds must be low < high of shape {list(shape)} in environment units, got {low.tolist()} and "
+            f"action_bounds must be low <= high of shape {list(shape)} in environment units, got {low.tolist()} and "
             f"{high.tolist()}: was the model trained for another environment?"
         )
-    mean, std = world_model.action_mean.float().cpu(), world_model.action_std.float().cpu()
-    # No distribution inside the bounds has a mean outside them or a std above half their distance.
-    if ((mean < low) | (mean > high) | (std > (high - low) / 2 * 1.001)).any() and (std != 1).any():
+    mean, std = _moments(world_model)
+    if _none_were_given(mean, std):
+        return low, high
+    # No distribution inside the bounds has a mean outside them or a std above half their distance. A std of 1 stands
+    # for a component that never changed. Statistics of a model in half precision are rounded.
+    eps = max(torch.finfo(world_model.action_mean.dtype).eps, torch.finfo(torch.float32).eps)
+    rounding, slack = max(1e-3, eps), eps * torch.maximum(low.abs(), high.abs())
+    outside = (mean < low - slack) | (mean > high + slack)
+    too_wide = (std > (high - low) / 2 * (1 + rounding)) & (std != 1)
+    if (outside | too_wide).any():
         raise ValueError(
             f"the model's action statistics (mean {mean.tolist()}, std {std.tolist()}) cannot come from actions "
             f"between {low.tolist()} and {high.tolist()}: was the model trained for another environment?"
@@ -44,7 +51,61 @@ def check_bounds(world_model: LatentWorldModel, bounds: tuple[Sequence[float], S
     return low, high
 
 
-def block_bounds(world_model: LatentWorldModel, bounds: Bounds) -> Bounds:
-    """Raw bounds (low [A], high [A]) -> those of a z-scored action block, (low [F * A], high [F * A])."""
+def constant_components(world_model: LatentWorldModel, bounds: Bounds | None) -> torch.Tensor:
+    """Which action components no search may vary, because the model has never seen them change.
+
+    Those that the action statistics flag, those whose bounds are equal, and those whose std of 1, which stands for a
+    component that never changed, is more than any actions between the bounds can have around their mean.
+
+    Args:
+        world_model: its statistics have A dimensions.
+        bounds: (low [A], high [A]) that passed :func:`check_bounds`, or None.
+
+    Returns:
+        [A] bool, on the CPU.
+    """
+    mean, std = _moments(world_model)
+    flagged = getattr(world_model.statistics, "constant", None)
+    constant = torch.zeros_like(mean, dtype=torch.bool) if flagged is None else flagged.cpu()
+    if bounds is None:
+        return constant
+    low, high = bounds
+    constant = constant | (low == high)
+    if _none_were_given(mean, std):
+        return constant
+    return constant | ((std == 1) & (1 > (high - mean).clamp_min(0) * (mean - low).clamp_min(0) * 1.002))
+
+
+def block_bounds(world_model: LatentWorldModel, bounds: Bounds | None) -> Bounds | None:
+    """Bounds of a z-scored action block, between which constant components have one value.
+
+    Args:
+        world_model: its statistics have A dimensions.
+        bounds: (low [A], high [A]) in environment units that passed :func:`check_bounds`; None for none.
+
+    Returns:
+        (low [F * A], high [F * A]) on the model's device, in float32 or float64; None where nothing is bounded.
+    """
+    constant = constant_components(world_model, bounds)
+    if bounds is None and not constant.any():
+        return None
     statistics, repeat = world_model.statistics, world_model.frame_skip
-    return tuple(statistics.normalize(bound.to(statistics.mean)).repeat(repeat) for bound in bounds)
+    kind = {"device": statistics.mean.device, "dtype": torch.promote_types(statistics.mean.dtype, torch.float32)}
+    if bounds is None:
+        high = torch.full(constant.shape, torch.inf, **kind)
+        low = -high
+    else:
+        low, high = (statistics.normalize(bound.to(**kind)) for bound in bounds)
+    held = torch.zeros_like(low).clamp(low, high)  # z = 0 is the value that the data always had
+    constant = constant.to(low.device)
+    return tuple(torch.where(constant, held, bound).repeat(repeat) for bound in (low, high))
+
+
+def _moments(world_model: LatentWorldModel) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean and std [A] of raw actions, float32, on the CPU."""
+    return world_model.action_mean.float().cpu(), world_model.action_std.float().cpu()
+
+
+def _none_were_given(mean: torch.Tensor, std: torch.Tensor) -> bool:
+    """Whether these are the zeros and ones of a model without statistics, which say nothing about actions."""
+    return bool((mean == 0).all() and (std == 1).all())

@@ -40,6 +40,10 @@ class LatentPlanner(MPCPlannerBase):
     kernels: environments are imagined in groups, on CPUs of 512 candidates in all. With 257 candidates or more, that is
     environment by environment, and a plan on a CPU is the same to the last bit in any company.
 
+    An action component that never changed in the training data stays at its mean in every candidate, as does one whose
+    bounds are equal. A model cast to another dtype is rolled out in that dtype unless ``config.precision`` is
+    ``"bf16"``; the search itself computes in float32, or in float64 for float64 latents.
+
     Args:
         world_model: the dynamics; put it into ``eval()`` first.
         config: settings, of the kind in ``config_class``.
@@ -101,7 +105,7 @@ class LatentPlanner(MPCPlannerBase):
 
     def block_bounds(self) -> tuple[torch.Tensor, torch.Tensor] | None:
         """Bounds of a z-scored action block, (low [F * A], high [F * A]), or None."""
-        return None if self.action_bounds is None else block_bounds(self.world_model, self.action_bounds)
+        return block_bounds(self.world_model, self.action_bounds)
 
     @property
     def context(self) -> int:
@@ -147,9 +151,10 @@ class LatentPlanner(MPCPlannerBase):
             initial: mean of the first iteration, z-scored [E, horizon, F * A]; zeros when None.
 
         Returns:
-            ``plan`` [E, horizon, F * A], z-scored, and ``plan_cost`` [E], the cost predicted for it. With
-            ``config.trace`` also, under ``trace``, of every iteration (NaN after an early stop): the ``best_cost`` of
-            all candidates, the mean ``elite_cost`` and their mean standard deviation ``spread``, each [E, iterations].
+            ``plan`` [E, horizon, F * A], z-scored, in the dtype of ``latent``, and ``plan_cost`` [E], the cost
+            predicted for it. With ``config.trace`` also, under ``trace``, of every iteration (NaN after an early stop):
+            the ``best_cost`` of all candidates, the mean ``elite_cost`` and their mean standard deviation ``spread``,
+            each [E, iterations].
 
         Raises:
             ValueError: other shapes, numbers that are not finite, or a world model in train mode.
@@ -163,13 +168,15 @@ class LatentPlanner(MPCPlannerBase):
             initial = latent.new_zeros(len(latent), self.config.horizon, self.world_model.block_dim)
         self._check_inputs(latent, goal, seeds, past_action, initial)
         first = max(0, latent.shape[1] - self.context)
-        latent, past_action = latent[:, first:], past_action[:, first:]
+        latent, past_action, given = latent[:, first:], past_action[:, first:], latent.dtype
+        # Means and deviations of a population need float32 whatever the model computes in.
+        working = torch.promote_types(given, torch.float32)
+        latent, past_action, goal, initial = (x.to(working) for x in (latent, past_action, goal, initial))
         group = self._group_size(latent)
         if latent.device.type == "cpu":
             keep_freed_memory()
         self._wanted = wanted_by(self.cost)
-        fast = uses_bf16(latent.device, self.config.precision)
-        dynamics = self._fast.of(self.world_model) if fast else self.world_model
+        dynamics = self._fast.of(self.world_model) if self._wants_bf16_copy() else self.world_model
         with torch.inference_mode(not self.needs_gradient), torch.no_grad():
             if self.needs_gradient:  # autograd keeps no tensor that was made in an inference mode outside
                 latent, past_action, goal, initial = (x.clone() for x in (latent, past_action, goal, initial))
@@ -178,6 +185,7 @@ class LatentPlanner(MPCPlannerBase):
                 for i in range(0, len(latent), group)
             ]
         result = torch.cat(results).clone()  # outside the inference mode, so that the user may write into it
+        result[PLAN] = result[PLAN].to(given)
         if not (result[PLAN].isfinite().all() and result[PLAN_COST].isfinite().all()):
             raise ValueError("planning gave numbers that are not finite: did the predictor diverge, or the cost?")
         return result
@@ -238,6 +246,13 @@ class LatentPlanner(MPCPlannerBase):
             ).unsqueeze(1)  # [e, 1, horizon, F * A]
         return problem
 
+    def _wants_bf16_copy(self) -> bool:
+        """Whether rollouts run in a bfloat16 copy of the predictor; a model cast by its user keeps its dtype."""
+        precision = self.config.precision
+        if precision == "auto" and _dtype_of(self.world_model.predictor, torch.empty(0)) != torch.float32:
+            precision = "fp32"
+        return uses_bf16(self.world_model.action_mean.device, precision)
+
     def _rollout_cost(self) -> Callable[..., torch.Tensor]:
         if not self.config.compile:
             return self._imagined_cost
@@ -252,11 +267,10 @@ class LatentPlanner(MPCPlannerBase):
         start = latent.unsqueeze(1).expand(-1, candidates, -1, -1)  # [e, K, C, D]
         past = past_action.unsqueeze(1).expand(-1, candidates, -1, -1)  # [e, K, C - 1, F * A]
         blocks = torch.cat([past, action], dim=2)
-        if dynamics is not self.world_model:
-            start, blocks = start.bfloat16(), blocks.bfloat16()
-        predicted = dynamics.rollout(start, blocks).float()  # [e, K, horizon, D]
+        dtype = _dtype_of(dynamics.predictor, start)
+        predicted = dynamics.rollout(start.to(dtype), blocks.to(dtype)).float()  # [e, K, horizon, D]
         extra = {"action": action, "start": latent[:, -1]}
-        with autocast(latent.device, self.config.precision):
+        with autocast(latent.device, "fp32" if dynamics is self.world_model else "bf16"):
             cost = self.cost(predicted, goal, **{name: extra[name] for name in self._wanted})
         if cost.shape != action.shape[:2]:
             raise ValueError(
@@ -268,3 +282,8 @@ class LatentPlanner(MPCPlannerBase):
     @abc.abstractmethod
     def _search(self, problem: Problem) -> TensorDict:
         """``plan`` [e, horizon, F * A] and ``plan_cost`` [e] of a group of environments."""
+
+
+def _dtype_of(module: nn.Module, default: torch.Tensor) -> torch.dtype:
+    """Dtype of a module's floating-point parameters, that of ``default`` where it has none."""
+    return next((p.dtype for p in module.parameters() if p.is_floating_point()), default.dtype)

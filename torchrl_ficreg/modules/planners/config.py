@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Literal
 
 from torchrl_ficreg.modules.precision import Precision, uses_bf16
+
+_LARGEST_COUNT = 10**6  # of candidates, iterations, blocks and proposals: a slip of the keyboard beyond
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,12 @@ class PlanConfig:
         for name in ("stop_spread", "num_proposals", "proposal_std", "seed"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
+        for field in fields(self):
+            if field.type == "float" and math.isinf(getattr(self, field.name)):
+                raise ValueError(f"{field.name} must be finite, got {getattr(self, field.name)}.")
+        for name in ("num_candidates", "iterations", "horizon", "num_proposals"):
+            if getattr(self, name) > _LARGEST_COUNT:
+                raise ValueError(f"{name} must be at most {_LARGEST_COUNT}, got {getattr(self, name)}.")
         for name, choices in (("bounds", ("environment", "none")), ("history", ("context", "one_frame"))):
             if getattr(self, name) not in choices:
                 raise ValueError(f"unknown {name} {getattr(self, name)!r}: choose {choices[0]!r} or {choices[1]!r}.")

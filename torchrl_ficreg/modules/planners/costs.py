@@ -87,7 +87,7 @@ class InverseConsistency(nn.Module):
     The mean squared error, in z-scores, between a candidate's action blocks and those that the inverse dynamics model
     recovers from its imagined latents. Where a search leaves what the predictor has learnt, imagined transitions stop
     looking like consequences of their actions, and this cost rises. Add it to a distance by a scale-free
-    :class:`CostSum`.
+    :class:`CostSum`. A model with a ``history`` H, such as the transformer, judges every step from the last H latents.
 
     Args:
         inverse_model: reads two latents, writes the recovered action block; see
@@ -111,9 +111,21 @@ class InverseConsistency(nn.Module):
         """[E, K, T, D], [E, D], [E, K, T, F * A] and [E, D] -> [E, K]."""
         first = start[:, None, None].expand(-1, predicted.shape[1], 1, -1)  # [E, K, 1, D]
         before = torch.cat([first, predicted[:, :, :-1]], dim=2)  # [E, K, T, D]
-        judged = self.inverse_model(TensorDict(dict(zip(self.inverse_model.in_keys, (before, predicted)))))
-        recovered = judged.get(self.inverse_model.out_keys[0])  # [E, K, T, F * A]
+        history = getattr(getattr(self.inverse_model, "module", self.inverse_model), "history", None)
+        if history is None or before.shape[2] <= history:
+            recovered = self._recover(before, predicted)  # [E, K, T, F * A]
+        else:  # every window of H latents at once: the first tells its H actions, each later one its last
+            windows = (latent.unfold(2, history, 1).transpose(-1, -2) for latent in (before, predicted))
+            found = self._recover(*windows)  # [E, K, T - H + 1, H, F * A]
+            recovered = torch.cat([found[:, :, 0], found[:, :, 1:, -1]], dim=2)
         return (recovered - action).square().mean((-1, -2))
+
+    def _recover(self, latent: torch.Tensor, next_latent: torch.Tensor) -> torch.Tensor:
+        """Action blocks that the model recovers from latents in whatever dtype; its own, if it was cast."""
+        dtype = next((p.dtype for p in self.inverse_model.parameters()), latent.dtype)
+        inputs = (latent.to(dtype), next_latent.to(dtype))
+        judged = self.inverse_model(TensorDict(dict(zip(self.inverse_model.in_keys, inputs))))
+        return judged.get(self.inverse_model.out_keys[0]).to(latent.dtype)
 
 
 class CostSum(nn.Module):

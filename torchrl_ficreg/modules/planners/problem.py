@@ -20,7 +20,7 @@ class Problem:
         past_action: z-scored blocks executed between the frames of the context [e, C - 1, F * A].
         goal: [e, D].
         initial: mean of the first iteration [e, horizon, F * A].
-        bounds: of a z-scored block, (low [F * A], high [F * A]), or None.
+        bounds: of a z-scored block, (low [F * A], high [F * A]), equal where a component is held, or None.
         generators: one for each environment.
         imagined_cost: (latent, past_action, goal, candidates [e, K, horizon, F * A]) -> [e, K].
         proposals: what a policy would do [e, P, horizon, F * A], or None.
@@ -46,8 +46,8 @@ class Problem:
     def noise(self, count: int) -> torch.Tensor:
         """Standard normal draws [e, count, horizon, F * A], each environment's from its own generator."""
         shape = (count, *self.initial.shape[1:])
-        device = self.initial.device
-        return torch.stack([torch.randn(shape, generator=g, device=device) for g in self.generators])
+        draws = [torch.randn(shape, generator=g, device=self.initial.device) for g in self.generators]
+        return torch.stack(draws).to(self.initial.dtype)
 
 
 def make_generator(seed: int, environment: int, device: torch.device) -> torch.Generator:

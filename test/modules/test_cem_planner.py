@@ -153,6 +153,8 @@ def test_it_is_a_torchrl_planner_and_a_tensordict_module(linear_world):
         ({"receding_horizon": 6}, "receding_horizon at most horizon, got 30, 5 and 6"),
         ({"std": 0.0}, "std must be positive, got 0.0"),
         ({"std": float("nan")}, "std must be positive, got nan"),
+        *[({name: float("inf")}, f"{name} must be finite") for name in ("std", "memory_budget", "proposal_std")],
+        *[({name: 10**12}, f"{name} must be at most 1000000") for name in ("num_candidates", "iterations", "horizon")],
         ({"bounds": "env"}, "unknown bounds 'env': choose 'environment' or 'none'"),
         ({"precision": "fp16"}, "unknown precision 'fp16'"),
         ({"seed": -1}, "seed must not be negative, got -1"),
@@ -168,7 +170,7 @@ def test_impossible_settings_are_refused(wrong, message):
     [
         (None, r"needs action_bounds=\(low, high\) in environment units, or PlanConfig\(bounds='none'\)"),
         (([-1.0], [1.0]), r"of shape \[2\].*another environment"),
-        (([-1.0, 1.0], [1.0, -1.0]), "low < high"),
+        (([-1.0, 1.0], [1.0, -1.0]), "low <= high"),
     ],
 )
 def test_impossible_bounds_are_refused(linear_world, bounds, message):

@@ -263,3 +263,20 @@ def test_a_scale_free_sum_plans_the_same_in_other_units(linear_world):
         planner = LatentMPPIPlanner(linear_world(), config, cost=cost)
         plans.append(planner.plan(torch.zeros(2, 2), torch.tensor([[3.0, 1.0], [-2.0, 0.5]]))["plan"])
     torch.testing.assert_close(plans[1], plans[0], rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize("blocks", [1, 3, 5, 8])
+def test_a_judge_with_a_history_judges_every_step_from_its_last_latents(blocks):
+    """Whatever the horizon: the error of step t is that of the window that ends at t."""
+    torch.manual_seed(0)
+    judge = InverseDynamicsModel(4, 6, 16, kind="transformer", history=3, heads=2, depth=1).eval()
+    predicted, goal = torch.randn(2, 5, blocks, 4), torch.randn(2, 4)
+    action, start = torch.randn(2, 5, blocks, 6), torch.randn(2, 4)
+    before = torch.cat([start[:, None, None].expand(-1, 5, 1, -1), predicted[:, :, :-1]], dim=2)
+    errors = []
+    for step in range(blocks):
+        window = slice(max(0, step - 2), step + 1)
+        recovered = judge(latent=before[:, :, window], next_latent=predicted[:, :, window])[:, :, -1]
+        errors.append((recovered - action[:, :, step]).square())
+    expected = torch.stack(errors, dim=2).mean((-1, -2))
+    torch.testing.assert_close(InverseConsistency(judge)(predicted, goal, action, start), expected)

@@ -220,8 +220,8 @@ def test_a_fresh_reset_forgets_the_past(tiny_world):
     ("arguments", "message"),
     [
         ({"reward": "sparse"}, "unknown reward 'sparse': choose one of 'progress', 'distance'"),
-        ({"action_bounds": ([-1.0], [1.0])}, r"low < high of shape \[2\].*another environment"),
-        ({"action_bounds": ([-1.0, 1.0], [1.0, -1.0])}, "low < high"),
+        ({"action_bounds": ([-1.0], [1.0])}, r"low <= high of shape \[2\].*another environment"),
+        ({"action_bounds": ([-1.0, 1.0], [1.0, -1.0])}, "low <= high"),
         ({"action_bounds": 1.0}, r"must be \(low, high\)"),
     ],
 )

@@ -8,8 +8,20 @@ from tensordict import TensorDict
 from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from torchrl_ficreg import LatentCEMPlanner, LatentPlanner, make_world_model, ModelConfig, MPCPolicy, PlanConfig
+from torchrl_ficreg import (
+    CostSum,
+    GoalDistance,
+    GoalPolicy,
+    InverseConsistency,
+    LatentCEMPlanner,
+    LatentPlanner,
+    make_world_model,
+    ModelConfig,
+    MPCPolicy,
+    PlanConfig,
+)
 from torchrl_ficreg.envs import make_env
+from torchrl_ficreg.modules.planners import SEARCHES
 
 SIZES = {"num_candidates": 8, "num_elites": 2, "iterations": 2, "horizon": 3, "precision": "fp32"}
 UNIT = ([-1.0, -1.0], [1.0, 1.0])
@@ -80,12 +92,21 @@ def test_a_reset_environment_is_planned_for_alone(linear_world):
     torch.testing.assert_close(td["mpc", "plan_cost"], torch.tensor([1.0, 50.0, 3.0]))
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
-def test_a_policy_cast_as_a_whole_plans_in_its_dtype(dtype):
-    """Queue and plan follow the model's dtype, through several plans; the cost stays a float32."""
-    model, _ = make_world_model(ModelConfig.preset("cpu", latent_dim=4, history=2), action_dim=2)
-    config = PlanConfig(num_candidates=4, num_elites=2, iterations=1, horizon=2, receding_horizon=1)
-    policy = MPCPolicy(LatentCEMPlanner(model.eval(), config, action_bounds=([-1, -1], [1, 1]))).to(dtype)
+@pytest.mark.parametrize("search", sorted(SEARCHES))
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+def test_a_policy_cast_as_a_whole_plans_in_its_dtype(dtype, search, fast_bf16):
+    """Queue and plan follow the model's dtype, through several plans; the cost stays a float32.
+
+    Whatever is called in between is cast with it: the predictor, a goal policy that proposes, a judge in the cost.
+    """
+    planner_class = SEARCHES[search]
+    model, inverse = make_world_model(ModelConfig.preset("cpu", latent_dim=4, history=2), action_dim=2)
+    config = planner_class.config_class(num_candidates=4, num_elites=2, iterations=1, horizon=2, receding_horizon=1)
+    cost = CostSum([GoalDistance(), InverseConsistency(inverse.eval())], [1.0, 0.5], scale_free=True)
+    planner = planner_class(
+        model.eval(), config, action_bounds=UNIT, cost=cost, policy=GoalPolicy(latent_dim=4, action_dim=10)
+    )
+    policy = MPCPolicy(planner).to(dtype)
     frame = torch.zeros(2, 3, 64, 64, dtype=torch.uint8)
     td = TensorDict({"pixels": frame, "goal_pixels": frame}, [2])
     for _ in range(6):

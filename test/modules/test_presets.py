@@ -95,3 +95,15 @@ def test_impossible_sizes_are_refused(wrong, message):
 def test_an_unknown_preset_is_refused():
     with pytest.raises(ValueError, match=r"unknown preset 'tiny': choose one of \['cpu', 'paper'\]"):
         ModelConfig.preset("tiny")
+
+
+def test_the_paper_preset_starts_from_the_published_weights():
+    """transformers' ViT: truncated normal 0.02 and no bias; the predictor's position embedding is N(0, 1)."""
+    torch.manual_seed(0)
+    config = ModelConfig.preset("paper", image_size=28, predictor_depth=1)
+    model, _ = make_world_model(config, action_dim=2)
+    network = model.encoder.module
+    for layer in (network.to_patch, *(part for part in network.blocks.modules() if isinstance(part, torch.nn.Linear))):
+        assert layer.weight.std().item() == pytest.approx(0.02, rel=0.02) and not layer.bias.any()
+    position = model.predictor.module.position
+    assert position.std().item() == pytest.approx(1.0, abs=4 / (2 * position.numel()) ** 0.5)

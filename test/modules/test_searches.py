@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from torchrl_ficreg import ActionEffort, CostSum, GoalDistance, GoalPolicy, LatentPlanner, LatentWorldModel
+from torchrl_ficreg.data import ActionStatistics
 from torchrl_ficreg.modules.planners import SEARCHES
 
 UNIT = ([-1.0, -1.0], [1.0, 1.0])
@@ -273,3 +274,42 @@ def test_compiled_it_plans_the_same(tiny_world):
 def test_a_search_that_nothing_could_stop_says_so(tiny_world, search):
     with pytest.raises(ValueError, match="leave stop_spread at 0"):
         make(search, tiny_world(), stop_spread=0.1)
+
+
+# Components that never change
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+@pytest.mark.parametrize(
+    ("mean", "std", "low", "high"),
+    [
+        ((0.1, 0.5), (0.3, 1.0), (-1.0, 0.5), (1.0, 0.5)),  # bounds measured on the data
+        ((0.0, 0.0), (0.1, 1.0), (-0.25, -0.25), (0.25, 0.25)),  # true bounds, narrower than the std of 1 that stands in
+        ((0.1, 0.9), (0.3, 1.0), (-1.0, -1.0), (1.0, 1.0)),
+    ],
+)
+def test_no_search_varies_what_the_data_never_varied(tiny_world, policy, search, mean, std, low, high):
+    """Neither in what it imagines nor in what is executed; the other component is searched as ever."""
+    world = tiny_world()
+    world.statistics = ActionStatistics(torch.tensor(mean), torch.tensor(std))
+    imagined = []
+
+    def cost(predicted, goal, action):
+        imagined.append(action.detach().clone().unflatten(-1, (-1, 2)))
+        return GoalDistance()(predicted, goal)
+
+    kind = SEARCHES[search]
+    planner = kind(world, kind.config_class(**FAST), action_bounds=(low, high), cost=cost, policy=policy)
+    plan = planner.plan(torch.randn(3, 6), torch.randn(3, 6))["plan"]
+    raw = world.statistics.denormalize(plan).unflatten(-1, (-1, 2))
+    torch.testing.assert_close(raw[..., 1], torch.full_like(raw[..., 1], mean[1]))
+    assert all((action[..., 1] == 0).all() for action in imagined)
+    assert raw[..., 0].std() > 0 and (raw[..., 0] >= low[0] - 1e-6).all() and (raw[..., 0] <= high[0] + 1e-6).all()
+
+
+@pytest.mark.parametrize("mean", [2.0, -0.3])
+def test_a_constant_outside_the_bounds_is_refused(tiny_world, mean):
+    world = tiny_world()
+    world.statistics = ActionStatistics(torch.tensor([0.0, mean]), torch.tensor([0.1, 1.0]))
+    with pytest.raises(ValueError, match="cannot come from actions between"):
+        SEARCHES["cem"](world, action_bounds=([-0.25, -0.25], [0.25, 0.25]))

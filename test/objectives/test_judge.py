@@ -7,10 +7,11 @@ import torch
 import torch.nn.functional as F
 from _loss_test_base import call, total
 from loss_collection import BLOCK, COLLECTION, FICREG, LATENT, make_clip, make_loss, make_mask
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from torchrl_ficreg import FICRegLoss, gradient_flow, InverseDynamicsModel, SIGReg
+from torchrl_ficreg import FICRegLoss, gradient_flow, InverseDynamicsModel, make_world_model, ModelConfig, SIGReg
 from torchrl_ficreg.objectives import ficreg
 from torchrl_ficreg.objectives.judge import judge_report
 
@@ -303,3 +304,25 @@ def ConvTriple():
     encoder, _, inverse_model = (getattr(make_loss("paper", 0.0), name) for name in NETWORKS)
     predictor = TensorDictModule(_Step(LATENT + BLOCK, LATENT), ["latent", "action"], ["predicted_latent"])
     return encoder.eval(), predictor, inverse_model
+
+
+@pytest.mark.parametrize("context", ["detached", "live"])
+def test_the_frozen_judge_moves_no_buffer(context):
+    """BatchNorm statistics of an inverse model are those of real transitions: they move once a step."""
+
+    class Inverse(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.norm, self.out = torch.nn.BatchNorm1d(32), torch.nn.Linear(32, 10)
+
+        def forward(self, before, after):
+            pairs = torch.cat([before, after], -1)
+            return self.out(self.norm(pairs.flatten(0, -2))).unflatten(0, pairs.shape[:-1])
+
+    model, _ = make_world_model(ModelConfig.preset("cpu"), 2)
+    inverse = TensorDictModule(Inverse(), ["before", "after"], ["recovered_action"])
+    loss = FICRegLoss(model.encoder, model.predictor, inverse, context=context)
+    pixels = torch.randint(0, 256, (8, 2, 3, 64, 64), dtype=torch.uint8)
+    loss(TensorDict({"pixels": pixels, "action": torch.randn(8, 2, 10)}, [8, 2]))
+    assert inverse.module.norm.num_batches_tracked == 1
+    assert model.predictor.module.projector.norm.num_batches_tracked == 1

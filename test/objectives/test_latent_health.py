@@ -25,11 +25,12 @@ def test_a_gaussian_is_at_the_floor_and_raises_no_alarm(shape):
 
 def test_effective_rank_counts_the_dimensions_that_are_used():
     """Of a flat spectrum it is the number of its entries (Roy and Vetterli, 2007)."""
-    rows = torch.eye(16).repeat(8, 1)
+    # Columns of a Hadamard matrix: orthogonal, of equal length and, but for the first, of mean 0 in exact arithmetic.
+    hadamard = torch.ones(1, 1)
+    for _ in range(7):
+        hadamard = torch.cat([torch.cat([hadamard, hadamard], 1), torch.cat([hadamard, -hadamard], 1)])  # [128, 128]
     for used in (2, 5, 16):
-        centred = rows[:, :used] - rows[:, :used].mean(0)
-        basis = torch.linalg.qr(centred)[0]
-        latent = torch.cat([basis, torch.zeros(128, 16 - used)], 1)
+        latent = torch.cat([hadamard[:, 1 : used + 1], torch.zeros(128, 16 - used)], 1)
         assert latent_health(latent).effective_rank == pytest.approx(used, rel=1e-3)
 
 

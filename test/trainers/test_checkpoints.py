@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import pickle
 import random
 import shutil
 import zipfile
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +19,9 @@ from torchrl import torchrl_logger
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 from torchrl.data import ListStorage, ReplayBuffer
 
-from torchrl_ficreg import LatentCEMPlanner, ModelConfig, MPCPolicy, PlanConfig
+from torchrl_ficreg import LatentCEMPlanner, make_world_model, ModelConfig, MPCPolicy, PlanConfig
 from torchrl_ficreg.data import OfflineTrajectories
-from torchrl_ficreg.trainers import find_checkpoint, load_world_model
+from torchrl_ficreg.trainers import checkpoint_components, find_checkpoint, load_world_model, ModelCard
 from torchrl_ficreg.trainers.checkpoint import latest_whole
 from torchrl_ficreg.trainers.rng import RandomState
 from torchrl_ficreg.trainers.stream import ReplayStream
@@ -336,3 +339,51 @@ def test_litter_of_killed_processes_is_harmless_and_swept(finished, tmp_path):
     trainer = make_trainer(tmp_path / "run")
     assert trainer.resume() and trainer.step == 27
     assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def _poisoned(folder, where, name):
+    """A real checkpoint with one more entry that a general loader would unpickle."""
+
+    class Marker:
+        def __reduce__(self):
+            return Path.touch, (where / "ran",)
+
+    folder.mkdir()
+    model, inverse_model = make_world_model(ModelConfig.preset("cpu"), 2)
+    card = ModelCard(asdict(ModelConfig.preset("cpu")), "two_room", {}, [-1.0, -1.0], [1.0, 1.0], {})
+    Checkpoint(**checkpoint_components(model, inverse_model, card)).save(folder / "checkpoint-1.torchrl")
+    state = next((folder / "checkpoint-1.torchrl" / "components").glob("*-world_model")) / "state"
+    if name == "other.pickle":
+        notes = json.loads((state / "meta.json").read_text())
+        notes["extra"] = {"type": "NonTensorData", "non_tensor": None}
+        notes["_type"] = "<class 'tensordict.tensorclass.NonTensorData'>"
+        (state / "meta.json").write_text(json.dumps(notes))
+    (state / name).parent.mkdir(exist_ok=True)
+    (state / name).write_bytes(pickle.dumps(Marker()))
+    return folder / "checkpoint-1.torchrl"
+
+
+@pytest.mark.parametrize("packed", [True, False], ids=["archive", "folder"])
+@pytest.mark.parametrize("name", ["other.pickle", "extra/other.pickle", "../state.pt", "../state.tdz", "tensor_x.memmap"])
+def test_a_checkpoint_with_other_entries_than_ours_is_refused_before_it_is_loaded(tmp_path, name, packed):
+    path = _poisoned(tmp_path / "run", tmp_path, name)
+    if packed:
+        folder = path.rename(tmp_path / "folder")
+        shutil.make_archive(str(tmp_path / "packed"), "zip", folder)
+        (tmp_path / "packed.zip").rename(path)
+    with pytest.raises(ValueError, match="not loaded"):
+        load_world_model(path)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_tensor_file_that_was_cut_is_refused_and_stays_as_it_is(tmp_path):
+    path = _poisoned(tmp_path / "run", tmp_path, "extra.json")
+    next(path.rglob("extra.json")).unlink()
+    load_world_model(path)  # whole
+    victim = max(path.rglob("tensor_*.memmap"), key=lambda file: file.stat().st_size)
+    content = victim.read_bytes()
+    for rest in (content[: len(content) // 2], b""):
+        victim.write_bytes(rest)
+        with pytest.raises(ValueError, match=f"{victim.name} has {len(rest)} bytes, expected {len(content)}"):
+            load_world_model(path)
+        assert victim.read_bytes() == rest

@@ -78,6 +78,7 @@ class CausalTransformer(nn.Module):
         attention_dropout: of its attention weights.
         projector_dim: hidden width of the BatchNorm projector at its end.
         action_bottleneck: see :class:`ActionEmbedding`.
+        position_std: standard deviation of the position embedding at the start of training.
 
     Attributes:
         checkpointing: see :func:`~torchrl_ficreg.modules.recompute.checkpoint_activations`.
@@ -100,8 +101,12 @@ class CausalTransformer(nn.Module):
         attention_dropout: float = 0.0,
         projector_dim: int = 2048,
         action_bottleneck: int = 10,
+        position_std: float = 0.02,
     ) -> None:
         super().__init__()
+        if not position_std >= 0:
+            raise ValueError(f"position_std must not be negative, got {position_std}.")
+        self.position_std = position_std
         self.history, self.latent_dim, self.action_dim = history, latent_dim, action_dim
         self.action_embedding = ActionEmbedding(action_dim, width, action_bottleneck)
         self.to_width = nn.Identity() if latent_dim == width else nn.Linear(latent_dim, width)
@@ -115,7 +120,7 @@ class CausalTransformer(nn.Module):
 
     def reset_parameters(self) -> None:
         """Draws the position embedding; the layers reset themselves."""
-        nn.init.normal_(self.position, std=0.02)
+        nn.init.normal_(self.position, std=self.position_std)
 
     def modulation(self, action: torch.Tensor) -> list[torch.Tensor]:
         """Action blocks [..., T, F * A] -> modulation of each layer [..., T, 6 * width].
@@ -196,8 +201,9 @@ class CausalPredictor(TensorDictModule):
     """``latent`` [..., T, D] and ``action`` [..., T, F * A] -> ``predicted_latent`` [..., T, D].
 
     Row t of the output predicts the latent one frame after row t of the input. AdaLN-zero conditioning on the action,
-    causal attention over at most H latents, dropout, BatchNorm projection. The defaults are the paper's
-    (arXiv 2603.19312): 11.7 M parameters.
+    causal attention over at most H latents, dropout, BatchNorm projection. The default sizes are the paper's
+    (arXiv 2603.19312): 11.7 M parameters. The published code also has ``attention_dropout=0.1`` and
+    ``position_std=1.0``, which ``ModelConfig.preset("paper")`` sets.
 
     Args:
         in_keys, out_key: where latents and action blocks are read, and predictions written.

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import Literal
+from typing import get_args, Literal
 
 from torchrl_ficreg.modules.conv import ConvEncoder
 from torchrl_ficreg.modules.inverse import INVERSE_NETWORKS, InverseDynamicsModel
 from torchrl_ficreg.modules.keypoints import KeypointEncoder
 from torchrl_ficreg.modules.predictor import CausalPredictor
-from torchrl_ficreg.modules.vit import ViTEncoder
+from torchrl_ficreg.modules.vit import Init, ViTEncoder
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 
@@ -26,6 +26,7 @@ class ModelConfig:
     frame_skip: int = 5  # F, environment steps between two frames of a clip
     latent_dim: int = 192  # D
     history: int = 3  # H, latents the predictor sees
+    encoder_init: Literal["torch", "published"] = "torch"  # of the "vit" encoder, see :class:`VisionTransformer`
     conv_channels: tuple[int, ...] = (16, 32, 64, 128)  # of the "conv" encoder; each layer halves the frame
     encoder_projector_dim: int = 2048  # hidden width of the BatchNorm projector of the "vit" and "conv" encoders
     keypoint_channels: tuple[int, ...] = (32, 64, 64)  # of the "keypoint" encoder's three convolutions
@@ -38,6 +39,7 @@ class ModelConfig:
     predictor_projector_dim: int = 2048
     predictor_dropout: float = 0.1
     predictor_attention_dropout: float = 0.0  # of the attention weights; the published predictor has 0.1
+    predictor_position_std: float = 0.02  # of the position embedding at the start; the published predictor has 1.0
     inverse_kind: Literal["mlp", "gaussian", "ensemble", "transformer"] = "mlp"
     inverse_hidden_dim: int = 512  # hidden width of the inverse dynamics model
 
@@ -46,10 +48,13 @@ class ModelConfig:
             object.__setattr__(self, name, tuple(getattr(self, name)))  # JSON and YAML know lists only
         if self.encoder not in ("vit", "conv", "keypoint"):
             raise ValueError(f"unknown encoder {self.encoder!r}: choose 'vit', 'conv' or 'keypoint'.")
+        if self.encoder_init not in get_args(Init):
+            raise ValueError(f"unknown encoder_init {self.encoder_init!r}: choose one of {get_args(Init)}.")
         if self.inverse_kind not in INVERSE_NETWORKS:
             raise ValueError(f"unknown inverse_kind {self.inverse_kind!r}: choose one of {sorted(INVERSE_NETWORKS)}.")
         shares = ("predictor_dropout", "predictor_attention_dropout")
-        sizes = {n: value for n, value in asdict(self).items() if not isinstance(value, (str, float)) and n not in shares}
+        others = (*shares, "predictor_position_std")
+        sizes = {n: value for n, value in asdict(self).items() if not isinstance(value, (str, float)) and n not in others}
         sizes = {name: value if isinstance(value, tuple) else (value,) for name, value in sizes.items()}
         small = [name for name, values in sizes.items() if min(values, default=0) < 1]
         if small:
@@ -57,13 +62,16 @@ class ModelConfig:
         for name in shares:
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} must lie in [0, 1), got {getattr(self, name)}.")
+        if not self.predictor_position_std >= 0:
+            raise ValueError(f"predictor_position_std must not be negative, got {self.predictor_position_std}.")
 
     @classmethod
     def preset(cls, name: str, **changes) -> ModelConfig:
         """A named size, with some of its numbers changed.
 
         Args:
-            name: ``"paper"``, ViT-Tiny/14 at 224 pixels (18.0 M parameters in the world model, arXiv 2603.19312), or
+            name: ``"paper"``, ViT-Tiny/14 at 224 pixels (18.0 M parameters in the world model, arXiv 2603.19312) with
+                the initialisation of the published code, or
                 ``"cpu"``, a convolutional encoder at 64 pixels that trains in minutes on two cores.
             **changes: fields to set otherwise.
         """
@@ -73,7 +81,7 @@ class ModelConfig:
 
 
 PRESETS = {
-    "paper": ModelConfig(predictor_attention_dropout=0.1),
+    "paper": ModelConfig(encoder_init="published", predictor_attention_dropout=0.1, predictor_position_std=1.0),
     "cpu": ModelConfig(
         encoder="conv",
         image_size=64,
@@ -104,7 +112,7 @@ def make_world_model(config: ModelConfig, action_dim: int) -> tuple[LatentWorldM
     block = config.frame_skip * action_dim
     sizes = {"image_size": config.image_size, "latent_dim": config.latent_dim}
     if config.encoder == "vit":
-        encoder = ViTEncoder(projector_dim=config.encoder_projector_dim, **sizes)
+        encoder = ViTEncoder(projector_dim=config.encoder_projector_dim, init=config.encoder_init, **sizes)
     elif config.encoder == "conv":
         encoder = ConvEncoder(channels=config.conv_channels, projector_dim=config.encoder_projector_dim, **sizes)
     else:
@@ -123,6 +131,7 @@ def make_world_model(config: ModelConfig, action_dim: int) -> tuple[LatentWorldM
         dropout=config.predictor_dropout,
         attention_dropout=config.predictor_attention_dropout,
         projector_dim=config.predictor_projector_dim,
+        position_std=config.predictor_position_std,
     )
     extra = {"history": config.history} if config.inverse_kind == "transformer" else {}
     inverse_model = InverseDynamicsModel(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args, Literal
+
 import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
@@ -14,6 +16,8 @@ from torchrl_ficreg.modules.projector import Projector
 from torchrl_ficreg.modules.recompute import run_block
 from torchrl_ficreg.modules.transformer import Block
 
+Init = Literal["torch", "published"]
+
 
 class VisionTransformer(nn.Module):
     """Class-token vision transformer (arXiv 2010.11929) with a BatchNorm projector on the class token.
@@ -23,9 +27,15 @@ class VisionTransformer(nn.Module):
         width, depth, heads, mlp_dim: of the transformer.
         projector_dim: hidden width of the projector.
         latent_dim: D.
+        init: of the linear layers before the projector, the patch projection among them. ``"torch"`` is PyTorch's
+            default; ``"published"`` draws weights from a normal distribution of standard deviation 0.02, truncated at
+            +-2, and sets biases to 0, as the encoder of the published code (transformers' ``ViTModel``) does.
 
     Attributes:
         checkpointing: see :func:`~torchrl_ficreg.modules.recompute.checkpoint_activations`.
+
+    Raises:
+        ValueError: an unknown ``init``, or an ``image_size`` that is no multiple of ``patch_size``.
     """
 
     checkpointing = False
@@ -41,11 +51,14 @@ class VisionTransformer(nn.Module):
         mlp_dim: int = 768,
         projector_dim: int = 2048,
         latent_dim: int = 192,
+        init: Init = "torch",
     ) -> None:
         super().__init__()
         if image_size % patch_size:
             raise ValueError(f"image_size {image_size} must be a multiple of patch_size {patch_size}.")
-        self.patch_size = patch_size
+        if init not in get_args(Init):
+            raise ValueError(f"unknown init {init!r}: choose one of {get_args(Init)}.")
+        self.patch_size, self.init = patch_size, init
         num_patches = (image_size // patch_size) ** 2
         self.normalize = PixelNormalizer(image_size)
         self.to_patch = Linear(3 * patch_size**2, width)
@@ -57,9 +70,15 @@ class VisionTransformer(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Draws the class token and the position embedding; the layers reset themselves."""
+        """Draws the class token, the position embedding and, under ``init="published"``, the linear layers."""
         nn.init.normal_(self.class_token, std=0.02)
         nn.init.normal_(self.position, std=0.02)
+        if self.init == "torch":
+            return  # the layers drew their weights when they were built
+        for layer in (self.to_patch, *self.blocks.modules()):
+            if isinstance(layer, nn.Linear):
+                nn.init.trunc_normal_(layer.weight, std=0.02)
+                nn.init.zeros_(layer.bias)
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         """[..., 3, H, W] -> [..., D]."""
@@ -76,7 +95,8 @@ class VisionTransformer(nn.Module):
 class ViTEncoder(TensorDictModule):
     """Encoder for large frames: ``pixels`` [..., 3, H, W] -> ``latent`` [..., D].
 
-    The defaults are the paper's ViT-Tiny/14 at 224 pixels (arXiv 2603.19312): 6.3 M parameters with its projector.
+    The default sizes are the paper's ViT-Tiny/14 at 224 pixels (arXiv 2603.19312): 6.3 M parameters with its projector.
+    The published initialisation is ``init="published"``.
 
     Args:
         in_key, out_key: where frames are read and latents are written.

@@ -151,7 +151,8 @@ class FICRegLoss(LeWMLoss):
             predicted: live predictions [B, T - 1, D], used in a live context.
             recovered: detached actions recovered from the real transitions [B, T - 1, F * A].
         """
-        frozen = self.inverse_model_params.detach()
+        # With buffers of its own: BatchNorm statistics of the judge are those of real transitions alone.
+        frozen = with_own_buffers(self.inverse_model_params).detach()
         params = with_own_buffers(self.predictor_params)
         if self.context == "detached":
             predicted = self._predict(real[..., :-1, :], clip.action, params)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import math
+import re
 import shutil
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +25,9 @@ from torchrl_ficreg.modules.world_model import LatentWorldModel
 CHECKPOINTS = "checkpoints"
 SUCCESS = "success_rate"  # in the manifest of a checkpoint; negative where it was not measured
 _CARD, _MODEL, _INVERSE = "card", "world_model", "inverse_model"
+_MEMBERS = re.compile(r"manifest\.json|components/[\w.%-]+/(value\.json|state\.json|state/(meta\.json|tensor_\d+\.memmap))")
+_FOLDER = {"shape": [], "_type": "<class 'tensordict._td.TensorDict'>"}  # what meta.json notes beside tensors
+_MOST_JSON = 64 * 2**20  # bytes of one text file of a checkpoint
 DAMAGES = (CheckpointError, zipfile.BadZipFile, EOFError)  # what reading a damaged or foreign checkpoint raises
 
 
@@ -111,6 +118,78 @@ def _is_whole(path: Path) -> bool:
         return False  # what a flipped byte makes zipfile raise depends on where it is
 
 
+def check_members(path: Path | str) -> None:
+    """Looks at every file of a checkpoint before a general loader does: nothing but JSON and tensors may be in it.
+
+    A general loader runs the code of a pickle that it meets, and fills a tensor file that is too short with zeros, in
+    place.
+
+    Args:
+        path: a checkpoint, archive or folder.
+
+    Raises:
+        ValueError: it holds files or entries other than the trainer writes, or a tensor file of another size than noted.
+    """
+    with _members(Path(path).expanduser()) as (sizes, read):
+        for name, size in sizes.items():
+            if not _MEMBERS.fullmatch(name):
+                raise ValueError(f"{path} holds {name[:80]!r}, which no checkpoint of this package has: it is not loaded.")
+            if name.endswith(".json") and size > _MOST_JSON:
+                raise ValueError(f"{path} is damaged: {name} takes {size} bytes, expected at most {_MOST_JSON}.")
+        for name in (name for name in sizes if name.endswith("state/meta.json")):
+            try:
+                notes = json.loads(read(name))
+                whole = all(notes.pop(key) == value for key, value in _FOLDER.items())
+                notes.pop("device", None)
+                needs = {key: _bytes_of(entry) for key, entry in notes.items()}
+            except (*DAMAGES, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+                raise ValueError(f"{path}: {name} notes something that is no tensor: it is not loaded.") from error
+            folder = name.removesuffix("meta.json")
+            found = {file.removeprefix(folder): size for file, size in sizes.items() if file.startswith(folder)}
+            del found["meta.json"]
+            if not whole or not found.keys() <= {f"{key}.memmap" for key in needs}:
+                raise ValueError(f"{path}: {name} and the tensors beside it do not fit together: it is not loaded.")
+            for key, need in needs.items():
+                size = found.get(f"{key}.memmap", 0)
+                if size != need:
+                    raise ValueError(f"{path} is damaged: {folder}{key}.memmap has {size} bytes, expected {need}.")
+
+
+def _bytes_of(entry: dict[str, Any]) -> int:
+    """Size of the tensor that an entry of ``meta.json`` notes.
+
+    Raises:
+        KeyError, ValueError: it notes something else.
+    """
+    dtype = getattr(torch, entry["dtype"].removeprefix("torch."))
+    if entry["is_nested"] or entry.keys() != {"device", "shape", "dtype", "is_nested"} or not isinstance(dtype, torch.dtype):
+        raise ValueError("no plain tensor")
+    return math.prod(entry["shape"]) * dtype.itemsize
+
+
+@contextmanager
+def _members(path: Path) -> Iterator[tuple[dict[str, int], Callable[[str], bytes]]]:
+    """Sizes of the regular files of an archive or a folder, by their names inside it, and how to read one.
+
+    Raises:
+        ValueError: it holds a link, a FIFO or a device.
+    """
+    if path.is_dir():
+        files = [file for file in sorted(path.rglob("*")) if file.is_symlink() or not file.is_dir()]
+        odd = [file for file in files if file.is_symlink() or not file.is_file()]
+        if odd:
+            raise ValueError(f"{odd[0]} is a link or no regular file: a checkpoint holds neither.")
+        yield {file.relative_to(path).as_posix(): file.stat().st_size for file in files}, lambda name: (path / name).read_bytes()
+        return
+    try:
+        archive = zipfile.ZipFile(path)
+    except (*DAMAGES, OSError) as error:
+        raise ValueError(f"{path} is not a whole checkpoint of a world model ({error}).") from error
+    with archive:
+        entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+        yield {entry.filename: entry.file_size for entry in entries}, archive.read
+
+
 def check_room(directory: Path, parameters: Iterable[torch.Tensor]) -> None:
     """Asks for room for a checkpoint before it is written: a disk that fills up under a memory map cannot be caught.
 
@@ -133,6 +212,7 @@ def read_card(path: Path | str) -> ModelCard:
     Raises:
         ValueError: a checkpoint of another kind, or a damaged one.
     """
+    check_members(path)
     try:
         return ModelCard(**Checkpoint(card={}).load(path, components=[_CARD]).values[_CARD])
     except (*DAMAGES, TypeError, KeyError) as error:

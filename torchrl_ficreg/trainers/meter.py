@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import resource
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from torchrl import torchrl_logger
 
 GIB = 2**30
 
@@ -32,6 +32,7 @@ class Meter:
         self, clips_per_step: int, waited: Callable[[], float] = lambda: 0.0, device: torch.device | str = "cpu"
     ) -> None:
         self.clips_per_step, self.waited, self.device = clips_per_step, waited, torch.device(device)
+        self._warned = False
         self.begin(0)
 
     def begin(self, step: int) -> None:
@@ -52,15 +53,20 @@ class Meter:
             "steps_per_second": rate,
             "clips_per_second": rate * self.clips_per_step,
             "loader_share": (self._since[1] - waited) / seconds,
-            "memory_gib": resident_memory() / GIB,
         }
+        memory = resident_memory()
+        if memory is not None:
+            numbers["memory_gib"] = memory / GIB
+        elif not self._warned:
+            torchrl_logger.warning("this system does not tell how much memory a process takes: no memory_gib is noted.")
+            self._warned = True
         if self.device.type == "cuda":
             numbers["cuda_memory_gib"] = torch.cuda.max_memory_allocated(self.device) / GIB
         return numbers
 
 
-def resident_memory() -> int:
-    """Bytes of this process that lie in memory; where the system does not tell, the most there ever were.
+def resident_memory() -> int | None:
+    """Bytes of this process that lie in memory; else the most there ever were; None where the system tells neither.
 
     Examples:
         >>> resident_memory() > 1_000_000
@@ -69,4 +75,8 @@ def resident_memory() -> int:
     statm = Path("/proc/self/statm")
     if statm.exists():
         return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from torchrl.trainers.trainers import LRSchedulerHook
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.modules.memory import keep_freed_memory
 from torchrl_ficreg.modules.precision import Precision
-from torchrl_ficreg.trainers.checkpoint import check_room, CHECKPOINTS, DAMAGES, latest_whole
+from torchrl_ficreg.trainers.checkpoint import check_members, check_room, CHECKPOINTS, DAMAGES, latest_whole
 from torchrl_ficreg.trainers.clock import Clock
 from torchrl_ficreg.trainers.distributed import from_main, is_main, rank, wait_for_all, world_size
 from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
@@ -34,7 +35,7 @@ METRICS = "metrics.csv"
 class OfflineTrainer(Trainer):
     """A :class:`torchrl.trainers.Trainer` that is fed by a replay buffer of clips.
 
-    One AdamW for everything, gradient clipping, linear warm-up and a cosine to zero over the real number of steps,
+    One AdamW for everything, gradient clipping, linear warm-up and a cosine to zero over the exact number of steps,
     bfloat16 autocast where the device is good at it. TorchRL's hooks register on it as on any trainer; a *frame* in
     their settings (``wait_for``, ``patience``) is one stored frame of a clip, batch x T of them a step.
 
@@ -62,8 +63,11 @@ class OfflineTrainer(Trainer):
         loss_module: a loss such as :class:`~torchrl_ficreg.FICRegLoss`, already on its device.
         replay_buffer: training clips, in whole batches (``drop_last``).
         epochs: passes over all clips.
+        schedule_epochs: length of the learning rate's schedule, in epochs and at least ``epochs``; None: ``epochs``. A run
+            that ends earlier than its schedule ends at a rate above zero.
+        keep_epoch: epoch whose checkpoint stays, as ``checkpoints/epoch-<n>.torchrl``, whatever comes later; None: none.
         lr, weight_decay: of AdamW.
-        warmup: share of all steps in which the learning rate rises from zero.
+        warmup: share of the schedule in which the learning rate rises from zero.
         clip_norm: largest gradient norm.
         precision: see :func:`~torchrl_ficreg.modules.precision.autocast`.
         run_dir: folder for metrics and checkpoints; None writes nothing.
@@ -88,6 +92,8 @@ class OfflineTrainer(Trainer):
         replay_buffer: OfflineTrajectories,
         *,
         epochs: int,
+        schedule_epochs: int | None = None,
+        keep_epoch: int | None = None,
         lr: float = 5e-5,
         weight_decay: float = 1e-3,
         warmup: float = 0.01,
@@ -109,6 +115,10 @@ class OfflineTrainer(Trainer):
                 "epochs, lr, clip_norm and log_interval must be positive, weight_decay not negative and warmup in "
                 f"[0, 1), got {epochs}, {lr}, {clip_norm}, {log_interval}, {weight_decay} and {warmup}."
             )
+        if schedule_epochs is not None and schedule_epochs < epochs:
+            raise ValueError(f"schedule_epochs must be at least epochs={epochs}, or None, got {schedule_epochs}.")
+        if keep_epoch is not None and not 1 <= keep_epoch <= epochs:
+            raise ValueError(f"keep_epoch must lie between 1 and epochs={epochs}, or be None, got {keep_epoch}.")
         if validation_buffer is not None and validation_batches < 1:
             raise ValueError(f"validation_batches must be positive, got {validation_batches}.")
         if accumulate < 1 or replay_buffer.batch_size % (2 * accumulate) and accumulate > 1:
@@ -122,6 +132,8 @@ class OfflineTrainer(Trainer):
         if getattr(loss_module, "reduction", "mean") == "none":
             raise ValueError("a loss with reduction='none' has no single number to descend: build it with 'mean'.")
         self.total_steps, self._resumed = epochs * self.steps_per_epoch, False
+        self.schedule_steps = (schedule_epochs or epochs) * self.steps_per_epoch
+        self.keep_epoch = keep_epoch
         frames = replay_buffer.batch_size * replay_buffer.num_frames  # of one step
         self._check_parts(replay_buffer, validation_buffer)
         self.parallel = parallelise(loss_module, strategy, compile)
@@ -155,7 +167,7 @@ class OfflineTrainer(Trainer):
         )
         self._checkpoint_skip_warnings.add("logger")  # it has no state, on purpose
         self.logger = TolerantLogger.around(logger) if is_main() else None
-        self.schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, WarmupCosine(self.total_steps, warmup))
+        self.schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, WarmupCosine(self.schedule_steps, warmup))
         LRSchedulerHook(self.schedule, interval="optim").register(self)
         self.clock = Clock()
         self.register_module("clock", self.clock)
@@ -187,11 +199,13 @@ class OfflineTrainer(Trainer):
             start: a checkpoint, of another run say, to begin from where the run has none yet.
 
         Raises:
+            FileNotFoundError: the run is past ``keep_epoch``, and that epoch's checkpoint was not kept.
             ValueError: the checkpoint is damaged, or belongs to other networks, data or hooks.
         """
         latest = None if self.checkpoint_rotation is None else latest_whole(self.checkpoint_rotation)
         latest = from_main(start if latest is None else latest)
         if latest is not None:
+            check_members(latest)
             try:
                 checkpoint = Checkpoint() if self.checkpoint is None else self.checkpoint
                 # Every component takes its tensors to its own device; the one they came from may not exist here.
@@ -202,13 +216,14 @@ class OfflineTrainer(Trainer):
                     "damaged, move it away to continue from the one before."
                 ) from error
             planned = self.schedule.lr_lambdas[0].steps
-            if planned != self.total_steps:
+            if planned != self.schedule_steps:
                 raise ValueError(
-                    f"{latest} was scheduled for {planned} steps, not {self.total_steps}: the learning rate has fallen "
-                    "accordingly. Repeat its epochs and batch size, or begin another run."
+                    f"{latest} was scheduled for {planned} steps, not {self.schedule_steps}: the learning rate has "
+                    "fallen accordingly. Repeat its epochs, schedule_epochs and batch size, or begin another run."
                 )
             self.parallel.restored(self.optimizer)
             _align(self.optimizer)
+            self._keep(latest)  # the process may have been killed between the checkpoint and this
         self._resumed = True
         self._sweep()
         self.metrics_table.drop_after(self.step)
@@ -226,12 +241,37 @@ class OfflineTrainer(Trainer):
                     check_room(self.checkpoint_rotation.directory, self.loss_module.parameters())
                 try:
                     super()._save_trainer()
+                    if self.checkpoint_rotation is not None:
+                        self._keep(self.checkpoint_rotation.latest())
                 except (OSError, RuntimeError) as error:  # PyTorch reports a file that cannot grow as a RuntimeError
                     raise OSError(
                         f"the checkpoint of step {self.step} cannot be written ({error}): make room; the same command "
                         "continues from the last one."
                     ) from error
             wait_for_all()  # a process that ended meanwhile would have torchrun stop the writer too
+
+    @property
+    def kept(self) -> Path | None:
+        """Where the checkpoint of ``keep_epoch`` is, or will be."""
+        if self.keep_epoch is None or self.checkpoint_rotation is None:
+            return None
+        return self.checkpoint_rotation.directory / f"epoch-{self.keep_epoch}.torchrl"
+
+    def _keep(self, checkpoint: Path) -> None:
+        """Keeps a checkpoint beside the rotation, which does not touch it, where it is that of ``keep_epoch``."""
+        if self.kept is None or self.kept.exists() or not is_main():
+            return
+        end = self.keep_epoch * self.steps_per_epoch
+        if self.step > end:
+            raise FileNotFoundError(
+                f"{self.kept} is missing: this run is past epoch {self.keep_epoch} and did not keep it. Choose another "
+                "epoch, or begin another run."
+            )
+        if self.step == end:
+            self.kept.parent.mkdir(parents=True, exist_ok=True)
+            part = self.kept.with_name(f".{self.kept.name}.part")
+            shutil.copyfile(checkpoint, part)
+            os.replace(part, self.kept)
 
     def _sweep(self) -> None:
         """Removes what a killed process left half-written beside its checkpoints."""

@@ -9,7 +9,7 @@ class WarmupCosine:
     """Factor of the learning rate: linear from 0 over the warm-up, then a cosine to 0 at the last step.
 
     Args:
-        steps: of the whole run.
+        steps: of the whole schedule, which a run may leave before its end.
         warmup: share of them in which the factor rises.
 
     Examples:

@@ -25,14 +25,17 @@ class Preempted(SystemExit):
 
     Args:
         signum: the signal received.
+        resumes: bool, whether the same command continues, rather than starting over; it only changes the message.
+            Default: True.
     """
 
-    def __init__(self, signum: int) -> None:
+    def __init__(self, signum: int, resumes: bool = True) -> None:
         super().__init__(_INTERRUPTED if signum == signal.SIGINT else PREEMPTED)
-        self.signal = signal.Signals(signum)
+        self.signal, self.resumes = signal.Signals(signum), resumes
 
     def __str__(self) -> str:
-        return f"stopped by {self.signal.name}: the same command continues where it stopped."
+        then = "continues where it stopped" if self.resumes else "starts over"
+        return f"stopped by {self.signal.name}: the same command {then}."
 
 
 class _Handler:
@@ -70,6 +73,10 @@ class _Handler:
 class exit_on_signal(_Handler):  # noqa: N801 (reads as a statement, like contextlib's)
     """Context: a signal raises :class:`Preempted` where the process happens to be, so that ``finally`` clauses run.
 
+    Args:
+        *signals: SIGTERM unless told otherwise.
+        resumes: bool, see :class:`Preempted`. Default: True.
+
     Examples:
         >>> with exit_on_signal():
         ...     os.kill(os.getpid(), signal.SIGTERM)
@@ -78,11 +85,12 @@ class exit_on_signal(_Handler):  # noqa: N801 (reads as a statement, like contex
         torchrl_ficreg.trainers.signals.Preempted: stopped by SIGTERM: the same command continues where it stopped.
     """
 
-    def __init__(self, *signals: int) -> None:
+    def __init__(self, *signals: int, resumes: bool = True) -> None:
         super().__init__(signals or (signal.SIGTERM,))
+        self._resumes = resumes
 
     def _handle(self, number: int) -> None:
-        raise Preempted(number)
+        raise Preempted(number, self._resumes)
 
 
 class stop_on_signal(_Handler):  # noqa: N801

@@ -11,6 +11,7 @@ from ficreg_gpu_report import finished, read_metrics, read_results, Runs
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
+from summarize import planned
 
 COLORS = {"lewm": "tab:gray", "ficreg": "tab:blue"}
 
@@ -42,7 +43,7 @@ def draw_success(results: dict[tuple[str, str], dict[str, Any]], target: Path) -
         for place, (method, color) in enumerate(COLORS.items()):
             if (env, method) not in results:
                 continue
-            outcome, floor = results[env, method][method], results[env, method]["random"]
+            outcome, floor = planned(results[env, method])[1], results[env, method]["random"]
             low, high = outcome["success_interval"]
             rate = outcome["success_rate"]
             axis.bar(place, rate, color=color, yerr=[[rate - low], [high - rate]], capsize=4)

@@ -8,6 +8,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from summarize import planned
+
 Runs = dict[tuple[str, str], Path]  # environment and method -> folder of the run
 Results = dict[tuple[str, str], dict[str, Any]]
 
@@ -25,8 +27,9 @@ def write_report(out: Path, runs: Runs, facts: dict[str, Any]) -> None:
     """
     results = read_results(runs)
     pairs: dict[str, str] = {}
-    for (env, method), result in results.items():
-        if pairs.setdefault(env, result[method]["pairs_hash"]) != result[method]["pairs_hash"]:
+    for (env, _), result in results.items():
+        drawn = planned(result)[1]["pairs_hash"]
+        if pairs.setdefault(env, drawn) != drawn:
             raise ValueError(f"the runs of {env} were evaluated on different pairs: remove one of {sorted(runs.values())}.")
     content = {
         **facts,

@@ -56,9 +56,9 @@ def evaluate(run: Path, overrides: list[str]) -> dict:
     """Success on the frozen pairs, and seconds of planning in one episode."""
     with tempfile.TemporaryDirectory() as folder:
         call("evaluate.py", f"checkpoint={run}", f"output={folder}", "record=0", *overrides)
-        results = json.loads((Path(folder) / "results.json").read_text())
-    method = next(key for key in results if key in ("ficreg", "lewm", "joint_inverse", "pldm"))
-    outcome, plan = results[method], results["plan"]
+        (file,) = Path(folder).glob("*/results.json")
+        results = json.loads(file.read_text())
+    outcome, plan = results["policy"], results["plan"]
     steps = plan["receding_horizon"] * FRAME_SKIP
     return {
         "success_rate": outcome["success_rate"],

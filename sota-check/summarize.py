@@ -20,13 +20,18 @@ KEPT = (
 )
 
 
+def planned(result: dict) -> tuple[str, dict]:
+    """The method of a ``results.json`` and what its planner reached; earlier ones are keyed by the method's name."""
+    method = result.get("method") or next(key for key in result if key in ("ficreg", "lewm", "joint_inverse", "pldm"))
+    return method, result["policy"] if "policy" in result else result[method]
+
+
 def main(name: str, pattern: str) -> None:
     """One entry per run and, per method, the pooled success rate. All runs must share their pairs."""
     runs, pooled, hashes = {}, {}, set()
     for file in sorted(glob.glob(pattern)):
         result = json.loads(Path(file).read_text())
-        method = next(key for key in result if key in ("ficreg", "lewm", "joint_inverse", "pldm"))
-        outcome = result[method]
+        method, outcome = planned(result)
         hashes.add(outcome["pairs_hash"])
         runs[Path(file).parent.name] = {key: outcome[key] for key in KEPT} | {
             "random": result["random"]["success_rate"],

@@ -13,7 +13,7 @@ from torchrl_ficreg.data import OfflineTrajectories
 @entry_point("collect")
 def main(cfg: DictConfig) -> None:
     """Records what is missing and says what is there."""
-    check_settings(cfg)
+    check_settings(cfg, training=False)
     path = collect_dataset(cfg)
     dataset = OfflineTrajectories(path, split="all", num_frames=2, frame_skip=1)
     print(f"{path}: {len(dataset.episodes)} episodes, {dataset.num_steps} steps")

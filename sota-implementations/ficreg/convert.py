@@ -11,12 +11,14 @@ from cli import entry_point
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from torchrl_ficreg.data import EpisodeStore
-from torchrl_ficreg.data.convert import convert, open_source
+from torchrl_ficreg.data.convert import convert, open_source, TASKS
 
 
 @entry_point("convert")
 def main(cfg: DictConfig) -> None:
     """Converts what is missing and says what is there."""
+    if missing := sorted(OmegaConf.missing_keys(cfg)):
+        raise ValueError(f"name {' and '.join(missing)}: source=pusht_expert_train.h5 target=data/pusht, say.")
     # One line without the source of the warning, which is ours.
     warnings.showwarning = lambda message, *_: print(f"warning: {message}")
     if cfg.env_name and "env" in cfg:
@@ -34,6 +36,7 @@ def main(cfg: DictConfig) -> None:
         action=cfg.action,
         shift=cfg.shift,
         allow_incomplete=cfg.allow_incomplete,
+        skip_bad_episodes=cfg.skip_bad_episodes,
     ) as source:
         path = convert(
             source,
@@ -46,6 +49,11 @@ def main(cfg: DictConfig) -> None:
             check_alignment=cfg.check_alignment,
         )
     store = EpisodeStore.open(path)
+    if task["name"] is None or task["name"] not in TASKS:
+        warnings.warn(
+            f"{path} is of an environment that this package cannot build: train.py, evaluate.py and collect.py plan and "
+            "measure in env=" + ", ".join(sorted(TASKS)) + "; train on the dataset from Python (OfflineTrajectories)."
+        )
     print(f"{path}: {store.num_episodes} episodes, {store.num_steps} steps")
 
 

@@ -1,22 +1,51 @@
-"""Repeats the evaluation of a trained model: python evaluate.py checkpoint=runs/two_room_cpu_ficreg_seed0."""
+"""Evaluates a trained model: python evaluate.py checkpoint=runs/two_room_cpu_ficreg_seed0 plan=icem.
+
+Each evaluation has a folder of its own beside the run, <run>/evaluation/<search>_<hash of the settings>; the table shows
+all of them.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import signal
 from pathlib import Path
+from typing import Any
 
 from cli import entry_point
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from planning import check_horizon, make_policy, plan_config
-from utils import evaluate_beside_random, get_device, report, versions, write_json
+from planning import check_consistency, check_horizon, make_policy, plan_config
+from utils import (
+    claim_folder,
+    evaluate_beside_random,
+    flatten,
+    get_device,
+    report,
+    result_rows,
+    settings_of_card,
+    versions,
+    write_json,
+    write_text,
+)
 
+from torchrl_ficreg._utils import read_json
 from torchrl_ficreg.evaluation import save_episodes_gif, StartGoalPairs
-from torchrl_ficreg.trainers import find_checkpoint, load_world_model, ModelCard
+from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_model
+
+RESULTS = "results.json"
+LARGEST = 10**6  # of a count in a plan, and of a budget: more is a damaged or hostile card, or a slip
 
 
 @entry_point("evaluate")
 def main(cfg: DictConfig) -> None:
-    """Loads, plans on the frozen pairs, writes."""
+    """Evaluates; stopped by a signal, it says that the same command starts over."""
+    with exit_on_signal(signal.SIGTERM, signal.SIGINT, resumes=False):
+        evaluate(cfg)
+
+
+def evaluate(cfg: DictConfig) -> None:
+    """Loads, plans on the frozen pairs, prints, writes."""
     if OmegaConf.is_missing(cfg, "checkpoint"):
         raise ValueError("name the model to evaluate: checkpoint=runs/two_room_cpu_ficreg_seed0, say.")
     if cfg.budget is not None and cfg.budget < 1 or cfg.num_envs < 1 or min(cfg.record, cfg.num_workers) < 0:
@@ -33,14 +62,25 @@ def main(cfg: DictConfig) -> None:
     model, inverse_model, card = load_world_model(checkpoint)
     if pairs.env != card.env:
         raise ValueError(f"the model was trained on {card.env}, the pairs belong to {pairs.env}: give others, pairs=...")
-    plan = plan_of_run(cfg, card)
-    budget = cfg.budget or card.config["env"]["budget"]
+    trained = settings_of_card(card)
+    plan = plan_of_run(cfg, trained)
+    budget = cfg.budget or trained.env.get("budget")
+    check_sizes(plan, budget)
     plan_config(plan)
     check_horizon(plan, model.frame_skip, budget)
     device = get_device(cfg.device)
     bounds = (card.action_low, card.action_high)
     policy = make_policy(plan, model.to(device), inverse_model.to(device), bounds, run_dir)
-    method = card.config["method"]["name"]
+    settings = {
+        "checkpoint": checkpoint.name,
+        "pairs": pairs.hash,
+        "budget": budget,
+        "plan": OmegaConf.to_container(plan),
+    }
+    parent = Path(cfg.output or run_dir / "evaluation")
+    folder = claim_folder(parent / folder_name(settings), None if cfg.output else parent)
+    if (folder / RESULTS).exists():
+        print(f"{folder} holds this very evaluation: it is repeated and written anew")
     outcome, floor = evaluate_beside_random(
         policy,
         pairs,
@@ -50,25 +90,88 @@ def main(cfg: DictConfig) -> None:
         num_workers=cfg.num_workers,
         record=cfg.record,
     )
-    results = {method: outcome.summary(), "random": floor.summary(), "plan": OmegaConf.to_container(plan)}
-    output = Path(cfg.output or run_dir / "evaluation")
-    output.mkdir(parents=True, exist_ok=True)
-    write_json(output / "results.json", {**results, "checkpoint": checkpoint.name, "versions": versions()})
+    results = {**result_rows(str(trained.method.get("name")), plan, outcome, floor), **settings, "versions": versions()}
+    # Before anything is written: a full disk shall not cost the numbers.
+    show({folder.name: results, **read_others(parent, folder.name)})
+    resolved = {**OmegaConf.to_container(cfg), "budget": budget, "plan": settings["plan"]}
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(resolved)))
+    write_json(folder / RESULTS, results)
     if cfg.record:
-        save_episodes_gif(outcome, output / "episodes.gif")
-    report(results, (method, "random"), output)
+        save_episodes_gif(outcome, folder / "episodes.gif")
+    print(f"results and pictures in {folder}")
 
 
-def plan_of_run(cfg: DictConfig, card: ModelCard) -> DictConfig:
+def plan_of_run(cfg: DictConfig, trained: DictConfig) -> DictConfig:
     """The plan settings of the training run, with what was typed on the command line instead."""
     typed = [override.split("=")[0] for override in HydraConfig.get().overrides.task]
     if "plan" in typed:
+        check_consistency(cfg.plan, trained)
         return cfg.plan
-    plan = OmegaConf.create(card.config["plan"])
+    plan = trained.plan.copy()
     for field in typed:
         if field.startswith("plan."):
             OmegaConf.update(plan, field.removeprefix("plan."), OmegaConf.select(cfg, field))
+    check_consistency(plan, trained)
     return plan
+
+
+def check_sizes(plan: DictConfig, budget: Any) -> None:
+    """Refuses counts with which no evaluation would ever end.
+
+    Raises:
+        ValueError: one is too large, or the budget is no positive whole number.
+    """
+    if isinstance(budget, bool) or not isinstance(budget, int) or budget < 1:
+        raise ValueError(f"budget={budget!r} of the training run is no positive whole number: give budget=50, say.")
+    counts = {f"plan.{key}": value for key, value in plan.items() if key not in ("seed", "compile")} | {"budget": budget}
+    large = [f"{key}={value}" for key, value in counts.items() if isinstance(value, (int, float)) and value > LARGEST]
+    if large:
+        raise ValueError(f"{', '.join(large)}: expected at most {LARGEST}; give smaller ones on the command line.")
+
+
+def folder_name(settings: dict[str, Any]) -> str:
+    """The search and a hash of all that an outcome depends on."""
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+    return f"{settings['plan']['search']}_{digest[:8]}"
+
+
+def read_others(parent: Path, own: str) -> dict[str, dict[str, Any]]:
+    """The results of the other evaluations below a folder, by the names of their folders; says which are damaged."""
+    found = {}
+    for path in sorted(parent.glob(f"*/{RESULTS}")):
+        if path.parent.name == own:
+            continue
+        try:
+            results = read_json(path, "results of an evaluation")
+            flatten({**results["plan"], **results["random"]})
+            row_name(results), [float(results["policy"][key]) for key in ("success_rate", "success_rate_at_end")]
+            int(results["policy"]["solved_at_start"]), float(results["policy"]["seconds_per_plan"])
+            found[path.parent.name] = results
+        except (ValueError, TypeError, KeyError, OSError) as error:
+            print(f"left out of the table: {path} ({type(error).__name__}: {error})")
+    return found
+
+
+def row_name(results: dict[str, Any]) -> str:
+    """How the table calls an evaluation: by method and search."""
+    return f"{results['method']}, {results['search']}"
+
+
+def show(evaluations: dict[str, dict[str, Any]]) -> None:
+    """Prints a table over evaluations, by the names of their folders; the first is the one just made."""
+    shared = ("checkpoint", "pairs", "budget")
+    flat = {
+        name: {**{key: results[key] for key in shared}, **flatten(results["plan"], "plan.")}
+        for name, results in evaluations.items()
+    }
+    keys = dict.fromkeys(key for settings in flat.values() for key in settings if key != "plan.search")
+    differ = [key for key in keys if len({str(settings[key]) for settings in flat.values() if key in settings}) > 1]
+    notes = {
+        name: " ".join(f"{key.removeprefix('plan.')}={str(settings[key])[:24]}" for key in differ if key in settings)
+        for name, settings in flat.items()
+    }
+    rows = [(row_name(results), results["policy"], notes[name]) for name, results in evaluations.items()]
+    report([*rows, ("random", next(iter(evaluations.values()))["random"], "")])
 
 
 if __name__ == "__main__":

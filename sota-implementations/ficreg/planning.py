@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
@@ -60,6 +61,27 @@ def check_horizon(plan: DictConfig, frame_skip: int, budget: int) -> None:
         raise ValueError(
             f"plan.horizon={plan.horizon} blocks of {frame_skip} steps reach beyond the budget of {budget} steps: "
             f"set plan.horizon (and plan.receding_horizon) to at most {budget // frame_skip}, or raise the budget."
+        )
+
+
+def check_consistency(plan: DictConfig, config: DictConfig | dict[str, Any]) -> None:
+    """Refuses to plan with an inverse model that a run does not train.
+
+    Args:
+        plan: the ``plan`` group.
+        config: the whole configuration of the run.
+
+    Raises:
+        ValueError: ``plan.consistency`` is not zero, and nothing trains the inverse model.
+    """
+    if not plan.get("consistency", 0.0) > 0:
+        return
+    method, loss = config["method"], config.get("loss", {})
+    weight = {"lewm": 0.0, "pldm": method.get("idm_coeff")}.get(method["name"], loss.get("idm_coeff"))
+    if weight == 0:
+        raise ValueError(
+            f"plan.consistency={plan.consistency} asks the inverse model, which method={method['name']} has not trained "
+            "with these settings: give plan.consistency=0.0, or train with idm_coeff > 0 (method=ficreg, for instance)."
         )
 
 

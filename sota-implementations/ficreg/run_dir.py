@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointRotation
 from utils import flatten, write_text
 
+from torchrl_ficreg._utils import lock_file
 from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, find_checkpoint, read_card
 from torchrl_ficreg.trainers.offline import METRICS
 
@@ -28,11 +30,12 @@ evaluation:
 
 checkpoints/          the latest two, and the best where evaluation.every was set: weights, optimiser, schedule, random
                       state, position in the data, action statistics and configuration; torchrl.checkpoint opens them,
-                      torchrl_ficreg.trainers.load_world_model makes a model of them
-config.yaml           every setting, resolved
+                      torchrl_ficreg.trainers.load_world_model makes a model of them; epoch-* is the one that
+                      results.json is about, where evaluation.epoch was set
+config.yaml           every setting, resolved; from_run_dir: where the data lie, seen from here
 metrics.csv           losses, gradient norms, health of the latents, speed and memory; a row every few steps, and one of
                       held-out clips after every epoch
-pairs.json            starts and goals of the evaluation
+pairs.json            starts and goals of the evaluation; pairs_*.json of the further tests of evaluation.also
 results.json          success rates with their intervals, what training took, versions of the packages
 episodes.gif          rollouts of the planner
 learning_curve.png    losses against steps
@@ -44,6 +47,8 @@ wandb/, tensorboard/  files of the logger, where one was asked for
 _FREE = ("collect.", "distributed.", "device", "evaluation.", "plan.", "logger.", "resume")
 _FREE += ("optim.checkpoint_activations", "optim.compile")  # which change no number
 _FREE += ("env.budget", "env.goal_offset", "env.num_workers", "env.state_unit")
+_PLACES = ("data_dir", "dataset")
+_FROM_RUN_DIR = "from_run_dir"  # of config.yaml; the other settings are those of the command line
 
 
 def check_run_dir(cfg: DictConfig) -> Path:
@@ -55,16 +60,52 @@ def check_run_dir(cfg: DictConfig) -> Path:
     run_dir, ours = Path(cfg.runs_dir) / cfg.name, OmegaConf.to_container(cfg, resolve=True)
     path = run_dir / "config.yaml"
     if path.exists() and ((run_dir / METRICS).exists() or (run_dir / CHECKPOINTS).exists()):
-        theirs = OmegaConf.to_container(OmegaConf.load(path))
+        theirs = _read_config(path)
         if cfg.resume == "never":
             raise ValueError(f"{run_dir} holds a run and resume=never: give another name=..., or resume=auto.")
-        if not isinstance(theirs, dict) or "model" not in theirs:
-            raise ValueError(f"{path} is damaged: restore it, or give another name=...")
-        for config in (ours, theirs):  # a project may be moved, or started from another folder
-            config["data_dir"], config["runs_dir"] = (str(Path(config[key]).resolve()) for key in ("data_dir", "runs_dir"))
+        theirs["runs_dir"], places = ours["runs_dir"], theirs.pop(_FROM_RUN_DIR, None)  # it is the folder that was read
+        _same_places(ours, theirs, _from_run_dir(ours, run_dir), places if isinstance(places, dict) else {})
         if what := _differences(ours, theirs):
             raise ValueError(f"{run_dir} holds a run of another configuration ({what}): give another name=...")
     return run_dir
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    """The settings that a run noted.
+
+    Raises:
+        ValueError: they cannot be read.
+    """
+    try:
+        text = path.read_text()
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
+            raise ValueError("it has aliases, of which a few lines can stand for gigabytes")
+        config = OmegaConf.to_container(OmegaConf.create(text))
+        if not isinstance(config, dict) or "model" not in config:
+            raise ValueError("it has no settings of a model")
+    except (ValueError, TypeError, AttributeError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
+        reason = " ".join(str(error).split())[:150]
+        raise ValueError(f"{path} is damaged ({reason}): restore it, or give another name=...") from error
+    return config
+
+
+def _from_run_dir(config: dict[str, Any], run_dir: Path) -> dict[str, str]:
+    """The way to each place from the run's folder, which stays the same wherever a command is given."""
+    places = {key: config[key] for key in _PLACES if config[key] is not None}
+    return {key: os.path.relpath(Path(place).resolve(), run_dir.resolve()) for key, place in places.items()}
+
+
+def _same_places(
+    ours: dict[str, Any], theirs: dict[str, Any], our_ways: dict[str, str] | None = None, ways: dict[str, Any] | None = None
+) -> None:
+    """Writes their places as ours are where both are one: seen from the run's folder, or from the working folder."""
+    for key in _PLACES:
+        mine, other = ours.get(key), theirs.get(key)
+        if mine is None or not isinstance(other, str):
+            continue
+        way = (our_ways or {}).get(key)
+        if way is not None and way == (ways or {}).get(key) or Path(mine).resolve() == Path(other).resolve():
+            theirs[key] = mine
 
 
 def _differences(ours: dict[str, Any], theirs: dict[str, Any], free: tuple[str, ...] = ()) -> str:
@@ -72,7 +113,7 @@ def _differences(ours: dict[str, Any], theirs: dict[str, Any], free: tuple[str, 
     ours, theirs = flatten(ours), flatten(theirs)
     keys = [key for key in sorted(ours | theirs) if not key.startswith((*_FREE, *free))]
     differ = [key for key in keys if ours.get(key) != theirs.get(key)]
-    return ", ".join(f"{key}: {theirs.get(key)} -> {ours.get(key)}" for key in differ[:3])
+    return ", ".join(f"{key}: {str(theirs.get(key))[:60]} -> {str(ours.get(key))[:60]}" for key in differ[:3])
 
 
 def find_start(cfg: DictConfig, run_dir: Path) -> Path | None:
@@ -91,9 +132,9 @@ def find_start(cfg: DictConfig, run_dir: Path) -> Path | None:
         if start.resolve().parent == own.resolve() and start.name != latest.name:
             raise ValueError(f"{own} holds later checkpoints than {start.name}: move those away, and resume=auto takes it.")
         return None
-    what = _differences(
-        OmegaConf.to_container(cfg, resolve=True), read_card(start).config, free=("name", "data_dir", "runs_dir")
-    )
+    ours, theirs = OmegaConf.to_container(cfg, resolve=True), dict(read_card(start).config)
+    _same_places(ours, theirs)
+    what = _differences(ours, theirs, free=("name", "data_dir", "runs_dir"))
     if what:
         raise ValueError(f"{start} was made with other settings ({what}): repeat them.")
     return start
@@ -109,10 +150,12 @@ def claim_run_dir(cfg: DictConfig) -> Path:
     run_dir = check_run_dir(cfg)
     run_dir.mkdir(parents=True, exist_ok=True)
     try:  # held, on the folder itself, until this process ends
-        fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock_file(os.open(run_dir, os.O_RDONLY), run_dir)
     except BlockingIOError as error:
         raise RuntimeError(f"another process is at work in {run_dir}: wait for it, or give another name=...") from error
-    write_text(run_dir / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
+    settings = OmegaConf.to_container(cfg, resolve=True)
+    settings[_FROM_RUN_DIR] = _from_run_dir(settings, run_dir)
+    write_text(run_dir / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(settings)))
     overrides = " ".join(HydraConfig.get().overrides.task) if HydraConfig.initialized() else f"name={cfg.name} ..."
     write_text(run_dir / README, _README.format(name=cfg.name, overrides=overrides, run_dir=f"{cfg.runs_dir}/{cfg.name}"))
     return run_dir

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
@@ -12,7 +13,7 @@ from tqdm import tqdm
 from torchrl_ficreg.data import EpisodeWriter
 from torchrl_ficreg.data.shards import NUM_SHARDS, SHARD, shard_meta, SHARD_NUMBER
 from torchrl_ficreg.envs.collect import EpisodeRecorder
-from torchrl_ficreg.envs.collectors import collect_shards
+from torchrl_ficreg.envs.collectors import collect_shards, CollectorKind
 from torchrl_ficreg.envs.registry import find_entry
 
 
@@ -26,6 +27,7 @@ def record_shards(cfg: DictConfig, path: Path, meta: dict[str, Any]) -> Path:
         ValueError: shards are there, unfinished, and no collector is named to go on with; or no collector wrote them.
     """
     begun, total = shard_meta(path), cfg.env.data.episodes
+    check_collector(cfg.collect.collector)
     count = begun[NUM_SHARDS] if begun else min(max(1, cfg.collect.num_workers), total)
     shares = [range(shard, total, count) for shard in range(count)]
     numbered = begun is None or SHARD_NUMBER in begun  # the first shards ever recorded are not
@@ -56,6 +58,19 @@ def record_shards(cfg: DictConfig, path: Path, meta: dict[str, Any]) -> Path:
                 writers[shard].append(episode)
                 bar.update()
     return path
+
+
+def check_collector(kind: str | None) -> None:
+    """Finds out before a folder is made whether a collector exists.
+
+    Raises:
+        ImportError: its package is missing.
+        ValueError: there is none of that name.
+    """
+    if kind is not None and kind not in get_args(CollectorKind):
+        raise ValueError(f"unknown collect.collector {kind!r}: choose null or one of {list(get_args(CollectorKind))}.")
+    if kind in ("ray", "submitit") and importlib.util.find_spec(kind) is None:
+        raise ImportError(f"collect.collector={kind} needs a package: pip install {kind}, or give collect.collector=async.")
 
 
 def recorder(cfg: DictConfig) -> EpisodeRecorder:

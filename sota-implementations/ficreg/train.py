@@ -21,21 +21,24 @@ from pathlib import Path
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # huge pages for large tensors on CPUs: torch looks when it starts
 import torch
 from cli import entry_point
-from episodes import find_dataset, make_dataset
+from episodes import check_writable, find_dataset, is_writable, make_dataset, nearest_folder
 from loggers import make_logger, publish
 from omegaconf import DictConfig
 from planning import make_policy
 from run_dir import check_run_dir, claim_run_dir, find_start
 from utils import (
     add_hooks,
+    check_card,
     check_settings,
     encoder_of,
     evaluate_beside_random,
     get_device,
     make_card,
     make_loss,
+    make_networks_without_memory,
     model_config,
     report,
+    result_rows,
     versions,
     write_json,
 )
@@ -52,6 +55,7 @@ from torchrl_ficreg.evaluation import (
 )
 from torchrl_ficreg.trainers import (
     checkpoint_components,
+    load_world_model,
     ModelCard,
     NoRegularizer,
     OfflineTrainer,
@@ -61,9 +65,9 @@ from torchrl_ficreg.trainers import (
     SuccessRate,
     TolerantLogger,
 )
+from torchrl_ficreg.trainers.checkpoint import check_room
 from torchrl_ficreg.trainers.distributed import is_main, process_group, rank, world_size
 from torchrl_ficreg.trainers.offline import METRICS
-from torchrl_ficreg.trainers.parallel import check_processes
 
 NOT_THE_TRAINERS = ("batch_size", "checkpoint_activations")  # of optim: settings of the dataset, and of the networks
 
@@ -72,28 +76,32 @@ NOT_THE_TRAINERS = ("batch_size", "checkpoint_activations")  # of optim: setting
 def main(cfg: DictConfig) -> None:
     """Data, training, evaluation, report."""
     check_settings(cfg)
-    check_processes(cfg.distributed.strategy, cfg.optim.batch_size)
     run_dir = check_run_dir(cfg)
+    check_writable(run_dir, "runs_dir")
+    check_room(nearest_folder(run_dir), make_networks_without_memory(cfg)[0].parameters())
     start = find_start(cfg, run_dir)
     data = find_dataset(cfg)  # of several processes one records, and the others wait for its lock
+    check_card(cfg, make_dataset(cfg, data, "train"))
+    make_dataset(cfg, data, "validation", drop_last=False)
     if not is_main():
         train(cfg, data, run_dir, None, start)
         return
-    pairs = draw_pairs(cfg, data)  # before training: too few episodes shall not come to light after it
+    tests = draw_tests(cfg, data)  # before training: too few episodes shall not come to light after it
     claim_run_dir(cfg)
     logger = make_logger(cfg, run_dir)
     model, inverse_model, card, training = train(cfg, data, run_dir, logger, start)
-    outcome = evaluate(cfg, data, run_dir, model, inverse_model, card, pairs)
+    outcome = evaluate(cfg, data, run_dir, model, inverse_model, card, tests)
     results = {**outcome, "training": training, "versions": versions()}
     write_json(run_dir / "results.json", results)
-    publish(logger, results, (cfg.method.name, "random"), run_dir)
-    report(results, (cfg.method.name, "random"), run_dir)
+    rows = {cfg.method.name: results["policy"], "random": results["random"]}
+    publish(logger, rows, tuple(rows), run_dir)
+    print(f"results and pictures in {run_dir}")
 
 
 def train(
     cfg: DictConfig, data: Path, run_dir: Path, logger: TolerantLogger | None = None, start: Path | None = None
 ) -> tuple[LatentWorldModel, InverseDynamicsModel, ModelCard, dict]:
-    """Trains, or continues, and returns the networks in eval mode. Processes part before anything else is done."""
+    """Trains, or continues, and returns the networks to be evaluated, in eval mode. Processes part before that."""
     with process_group(get_device(cfg.device)) as device:
         torch.manual_seed(cfg.seed)
         clips = make_dataset(cfg, data, "train", prefetch=1, part=(rank(), world_size()))
@@ -112,6 +120,7 @@ def train(
             log_interval=cfg.logger.interval,
             logger=logger,
             strategy=cfg.distributed.strategy,
+            keep_epoch=cfg.evaluation.epoch,
             **{key: value for key, value in cfg.optim.items() if key not in NOT_THE_TRAINERS},
         )
         add_hooks(cfg, trainer)
@@ -131,8 +140,12 @@ def train(
         refine(cfg, data, model, inverse_model, refinement)
         success.forget()
         trainer.save_trainer(force_save=True)
+    if trainer.kept is not None and is_main() and cfg.evaluation.epoch < cfg.optim.epochs:
+        model, inverse_model, _ = load_world_model(trainer.kept)
+        model, inverse_model = model.to(device), inverse_model.to(device)
     training = {
         "steps": trainer.step,
+        "evaluated_epoch": cfg.evaluation.epoch or cfg.optim.epochs,
         "clips": clips.num_clips,
         "resumed_at_step": resumed_at,
         "seconds": trainer.clock.seconds,
@@ -178,12 +191,18 @@ def measure_success(
     return {"success_rate": outcome.success_rate}
 
 
-def draw_pairs(cfg: DictConfig, data: Path) -> StartGoalPairs:
-    """The frozen start-goal pairs beside the dataset."""
+def draw_tests(cfg: DictConfig, data: Path) -> list[tuple[StartGoalPairs, int, str]]:
+    """Frozen start-goal pairs beside the dataset, their budget and a name: the main test, then those of ``also``."""
     held_out = make_dataset(cfg, data, "evaluation", drop_last=False)
-    count, offset, seed = cfg.evaluation.num_pairs, cfg.env.goal_offset, cfg.evaluation.seed
-    manifest = data / f"pairs_{count}x{offset}_seed{seed}.json"
-    return StartGoalPairs.frozen(manifest, held_out, cfg.env.name, count, offset, seed)
+    count, seed, tests = cfg.evaluation.num_pairs, cfg.evaluation.seed, []
+    for offset, budget in [(cfg.env.goal_offset, cfg.env.budget), *cfg.evaluation.also]:
+        manifest = data / f"pairs_{count}x{offset}_seed{seed}.json"
+        if not manifest.exists() and not is_writable(data):  # then they stand in the run's folder only, by evaluate()
+            pairs = StartGoalPairs.draw(held_out, cfg.env.name, count, offset, seed)
+        else:
+            pairs = StartGoalPairs.frozen(manifest, held_out, cfg.env.name, count, offset, seed)
+        tests.append((pairs, budget, f"goals_{offset}_steps_ahead_within_{budget}"))
+    return tests
 
 
 def evaluate(
@@ -193,28 +212,37 @@ def evaluate(
     model: LatentWorldModel,
     inverse_model: InverseDynamicsModel,
     card: ModelCard,
-    pairs: StartGoalPairs,
+    tests: list[tuple[StartGoalPairs, int, str]],
 ) -> dict:
-    """Plans on the frozen pairs, looks at the latent space, draws the pictures."""
+    """Plans on the frozen pairs of every test, prints the numbers, looks at the latent space, draws the pictures."""
     held_out = make_dataset(cfg, data, "evaluation", drop_last=False)
     settings = cfg.evaluation
-    pairs.save(run_dir / "pairs.json")
     policy = make_policy(cfg.plan, model, inverse_model, (card.action_low, card.action_high), run_dir)
-    outcome, floor = evaluate_beside_random(
-        policy,
-        pairs,
-        card,
-        budget=cfg.env.budget,
-        num_envs=settings.num_envs,
-        num_workers=settings.num_workers,
-        record=settings.record,
-    )
+    tables, outcome = {}, None
+    for pairs, budget, name in tests:
+        pairs.save(run_dir / ("pairs_" + name + ".json" if tables else "pairs.json"))
+        found, floor = evaluate_beside_random(
+            policy,
+            pairs,
+            card,
+            budget=budget,
+            num_envs=settings.num_envs,
+            num_workers=settings.num_workers,
+            record=0 if tables else settings.record,
+        )
+        outcome = outcome or found  # the pictures are of the first test
+        rows = tables[name] = result_rows(cfg.method.name, cfg.plan, found, floor)
+        # Before anything is written: a full disk shall not cost the numbers.
+        if len(tests) > 1:
+            print(f"\n{name.replace('_', ' ')}, {budget} steps allowed:")
+        report([(f"{cfg.method.name}, {cfg.plan.search}", rows["policy"], ""), ("random", rows["random"], "")])
     profile = latent_distance(model, held_out)
     if (run_dir / METRICS).exists():
         plot_learning_curve(run_dir / METRICS, run_dir / "learning_curve.png")
     plot_latent_distance(profile, run_dir / "latent_distance.png", unit=cfg.env.state_unit)
     save_episodes_gif(outcome, run_dir / "episodes.gif")
-    return {cfg.method.name: outcome.summary(), "random": floor.summary(), "latent_distance": profile.summary()}
+    first, *others = tables
+    return {**tables[first], "latent_distance": profile.summary(), **{name: tables[name] for name in others}}
 
 
 if __name__ == "__main__":

@@ -8,10 +8,12 @@ It goes beside the run's checkpoints, acts without planning, and proposes plans 
 from __future__ import annotations
 
 import json
+import signal
 import time
 import warnings
 from pathlib import Path
 
+import numpy as np
 import torch
 from cli import entry_point
 from episodes import dataset_path, find_dataset, make_dataset
@@ -19,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 from tqdm import trange
-from utils import encoder_of, flatten, get_device, versions, write_json
+from utils import claim_folder, encoder_of, flatten, get_device, settings_of_card, versions, write_json
 
 from torchrl_ficreg import LatentWorldModel
 from torchrl_ficreg.data.latents import BLOCKS, encode_episodes, GoalRows
@@ -27,7 +29,7 @@ from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.goal_policy import GoalPolicy, load_goal_policy, save_goal_policy
 from torchrl_ficreg.modules.precision import autocast, uses_bf16
 from torchrl_ficreg.modules.safe_files import require_safetensors
-from torchrl_ficreg.trainers import find_checkpoint, load_world_model, ModelCard, WarmupCosine
+from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_model, ModelCard, WarmupCosine
 
 METRICS = "metrics.json"
 # Where things are and how fast they go: settings that make no other policy.
@@ -36,8 +38,14 @@ _FREE = ("checkpoint", "dataset", "output", "overwrite", "device", "frames_per_b
 
 @entry_point("train_policy")
 def main(cfg: DictConfig) -> None:
-    """Loads, encodes once, trains, measures, writes."""
+    """Trains a policy, or shows the numbers of the one there is."""
     check_settings(cfg)
+    with exit_on_signal(signal.SIGTERM, signal.SIGINT, resumes=False):
+        train_beside(cfg)
+
+
+def train_beside(cfg: DictConfig) -> None:
+    """Loads, encodes once, trains, measures, writes."""
     checkpoint = find_checkpoint(cfg.checkpoint)
     folder = Path(cfg.output or checkpoint.parent.parent / "goal_policy")
     model, _, card = load_world_model(checkpoint)
@@ -46,6 +54,7 @@ def main(cfg: DictConfig) -> None:
         print(f"{folder} holds this policy already: overwrite=true trains it again.")
         report(metrics)
         return
+    claim_folder(folder, None if cfg.output else folder.parent)
     began = time.perf_counter()
     device = get_device(cfg.device)
     train_rows, held_out = make_rows(cfg, model.to(device), card)
@@ -60,16 +69,16 @@ def main(cfg: DictConfig) -> None:
         "config": OmegaConf.to_container(cfg),
         "versions": versions(),
     }
+    report(metrics)  # before anything is written: a full disk shall not cost the numbers
     (folder / METRICS).unlink(missing_ok=True)  # written last, it says that the folder is whole
     save_goal_policy(policy, folder, model)
     write_json(folder / METRICS, metrics)
-    report(metrics)
     print(f"policy and {METRICS} in {folder}")
 
 
 def make_rows(cfg: DictConfig, model: LatentWorldModel, card: ModelCard) -> tuple[GoalRows, GoalRows]:
     """Rows of the training episodes and of the validation episodes, every frame encoded once."""
-    run = OmegaConf.create(card.config)
+    run = settings_of_card(card)
     # Named explicitly, a dataset that has gone is missed rather than recorded anew.
     run.dataset = cfg.dataset or run.dataset or str(dataset_path(run))
     path, encode, rows = find_dataset(run), encoder_of(model, cfg.optim.precision), []
@@ -85,8 +94,9 @@ def train(cfg: DictConfig, model: LatentWorldModel, rows: GoalRows) -> GoalPolic
     torch.manual_seed(cfg.seed)
     generator = torch.Generator().manual_seed(cfg.seed)
     network, device = model.predictor.module, rows.latent.device
-    policy = GoalPolicy(network.latent_dim, network.action_dim, **cfg.policy).to(device)
-    policy.standardize_by(rows.latent)
+    policy = GoalPolicy(network.latent_dim, network.action_dim, **cfg.policy)
+    policy.standardize_by(rows.latent.cpu())  # in float64, which MPS has not
+    policy.to(device)
     with warnings.catch_warnings():  # of TorchRL's, about target parameters that BCLoss has none of
         warnings.filterwarnings("ignore", message="The name target_actor_network_params")
         loss_module = BCLoss(policy, loss_function="l2")
@@ -116,20 +126,21 @@ def measure(policy: GoalPolicy, rows: TensorDict) -> dict:
     """
     action = rows[ACTION]
     answer = torch.cat([policy.module(part[LATENT], part[GOAL_LATENT]) for part in rows.split(4096)])
-    error = (answer - action).square().sum(-1).double().cpu()  # [B]
-    spread = (action - action.mean(0)).square().sum(-1).double().cpu()  # [B]
-    blocks = rows[BLOCKS].cpu()
-    near = {int(k): blocks == k for k in blocks.unique()}
+    # Summed in float64 by NumPy: MPS has none.
+    error = (answer - action).square().sum(-1).cpu().numpy().astype(np.float64)  # [B]
+    spread = (action - action.mean(0)).square().sum(-1).cpu().numpy().astype(np.float64)  # [B]
+    blocks = rows[BLOCKS].cpu().numpy()
+    near = {int(k): blocks == k for k in np.unique(blocks)}
     return {
-        "loss": (error.mean() / action.shape[-1]).item(),
+        "loss": float(error.mean() / action.shape[-1]),
         "r2": _r2(error, spread),
         "r2_by_blocks": {str(k): _r2(error[here], spread[here]) for k, here in near.items()},
     }
 
 
-def _r2(error: torch.Tensor, spread: torch.Tensor) -> float | None:
-    total = spread.sum().item()
-    return 1 - error.sum().item() / total if total > 0 else None  # None where the action never changes
+def _r2(error: np.ndarray, spread: np.ndarray) -> float | None:
+    total = float(spread.sum())
+    return 1 - float(error.sum()) / total if total > 0 else None  # None where the action never changes
 
 
 def report(metrics: dict) -> None:

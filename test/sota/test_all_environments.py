@@ -31,7 +31,7 @@ def test_the_whole_path(env, execute, tmp_path):
     (run,) = (tmp_path / "runs").iterdir()
     results = json.loads((run / "results.json").read_text())
     assert run.name == f"{env}_cpu_ficreg_seed0"
-    for policy in ("ficreg", "random"):
+    for policy in ("policy", "random"):
         assert results[policy]["pairs"] == 2 and 0 <= results[policy]["success_rate"] <= 1
     frames = imageio.imread(run / "episodes.gif")
     assert frames.ndim == 4 and frames.std() > 5

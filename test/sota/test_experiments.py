@@ -29,12 +29,26 @@ def runs(*overrides: str) -> list[list[str]]:
     return BasicSweeper.split_arguments(parsed, None)[0]
 
 
-@pytest.mark.parametrize("method", ["ficreg", "lewm"])
-def test_an_experiment_is_four_environments_times_three_seeds(method):
-    found = runs(f"experiment={method}_paper")
+@pytest.mark.parametrize(
+    ("experiment", "method"),
+    [("ficreg_paper", "ficreg_live"), ("ficreg", "ficreg_detached"), ("lewm_paper", "lewm")],
+)
+def test_an_experiment_is_four_environments_times_three_seeds(experiment, method):
+    found = runs(f"experiment={experiment}")
     assert len(found) == 12
     names = {config(*overrides).name for overrides in found}
     assert names == {f"{env}_paper_{method}_seed{seed}" for env in ENVIRONMENTS for seed in range(3)}
+
+
+@pytest.mark.parametrize(("experiment", "context"), [("ficreg_paper", "live"), ("ficreg", "detached")])
+@pytest.mark.parametrize("env", ENVIRONMENTS)
+def test_the_published_code_is_run_to_the_letter(experiment, context, env):
+    """Context of the judgement, length of the schedule, epochs, initialisation and precision of the authors' code."""
+    cfg = config(f"experiment={experiment}", f"env={env}")
+    assert (cfg.method.context, cfg.optim.schedule_epochs, cfg.optim.epochs) == (context, 100, 15)
+    assert (cfg.evaluation.every, cfg.evaluation.epoch, cfg.plan.precision) == (1, 10, "fp32")
+    assert (cfg.model.encoder_init, cfg.model.predictor_position_std) == ("published", 1.0)
+    assert [list(goal) for goal in cfg.evaluation.also] == ([[100, 150]] if env == "two_room" else [])
 
 
 def test_the_command_line_narrows_it_down():
@@ -105,7 +119,7 @@ def test_a_sweep_over_seeds_makes_a_run_of_each(command, environment, tmp_path, 
     folders = sorted(path.name for path in (tmp_path / "runs").iterdir() if path.is_dir() and path.name[0] != ".")
     assert folders == ["two_room_cpu_ficreg_seed0", "two_room_cpu_ficreg_seed1"]
     results = [json.loads((tmp_path / "runs" / name / "results.json").read_text()) for name in folders]
-    assert results[0]["ficreg"]["pairs_hash"] == results[1]["ficreg"]["pairs_hash"]
+    assert results[0]["policy"]["pairs_hash"] == results[1]["policy"]["pairs_hash"]
     assert (tmp_path / "runs" / folders[0] / "checkpoints").is_dir()
 
 

@@ -61,7 +61,7 @@ def test_two_slots_make_one_report(tmp_path):
     assert report["complete"] and set(report["results"]) == NAMES and len(report["slots"]) == 2
     for env in ("two_room", "push_t"):
         for method in ("lewm", "ficreg"):
-            assert report["results"][f"{env}_{method}"][method]["pairs_hash"] == report["pairs_hash"][env]
+            assert report["results"][f"{env}_{method}"]["policy"]["pairs_hash"] == report["pairs_hash"][env]
     profile = report["profile"]
     assert 0 <= profile["loader_share"] <= 1 and 0 < profile["share_of_peak"] < 1
     assert profile["operations_per_step"] > profile["frames"] * 5e6 * 2  # more than one look at each weight

@@ -49,7 +49,8 @@ def evaluate(modules, monkeypatch, tmp_path):
         monkeypatch.chdir(folder)
         monkeypatch.setattr(sys, "argv", ["evaluate.py", f"checkpoint={RUN}", *small])
         modules("evaluate").main()
-        return json.loads((tmp_path / "out" / "results.json").read_text())
+        latest = max((tmp_path / "out").glob("*/results.json"), key=lambda path: path.stat().st_mtime_ns)
+        return json.loads(latest.read_text())
 
     return run
 
@@ -60,7 +61,7 @@ def test_every_search_can_be_named(trained, evaluate, files, search):
     before = files(trained)
     results = evaluate(trained, f"plan={search}", "plan.iterations=1", *SMALL[search])
     assert results["plan"]["search"] == search and results["plan"]["iterations"] == 1
-    assert results["ficreg"]["pairs"] == 4 and results["ficreg"]["seconds_per_plan"] > 0
+    assert results["policy"]["pairs"] == 4 and results["policy"]["seconds_per_plan"] > 0
     assert files(trained) == before
 
 
@@ -71,7 +72,7 @@ def test_it_may_plan_again_after_every_block(trained, evaluate, capsys, horizon)
     first = evaluate(trained, *overrides)
     assert first["plan"]["receding_horizon"] == 1 and first["plan"]["num_candidates"] == 20
     second = evaluate(trained, *overrides, "num_envs=3")
-    assert second["ficreg"]["first_success_step"] == first["ficreg"]["first_success_step"]
+    assert second["policy"]["first_success_step"] == first["policy"]["first_success_step"]
     assert "success" in capsys.readouterr().out
 
 

@@ -25,7 +25,7 @@ def weights(folder):
 
 def outcomes(folder):
     results = json.loads((folder / "results.json").read_text())
-    return {name: {k: v for k, v in row.items() if k != "seconds_per_plan"} for name, row in results.items() if "pairs" in row}
+    return {name: {k: v for k, v in row.items() if k != "seconds_per_plan"} for name, row in results.items() if name in ("policy", "random")}
 
 
 def test_a_run_leaves_exactly_the_documented_files(trained_once):
@@ -41,12 +41,13 @@ def test_a_run_leaves_exactly_the_documented_files(trained_once):
 
 def test_the_results_say_what_was_measured(trained):
     results = json.loads((trained / RUN / "results.json").read_text())
-    assert set(results) == {"ficreg", "random", "latent_distance", "training", "versions"}
-    for name in ("ficreg", "random"):
+    assert set(results) == {"method", "search", "policy", "random", "latent_distance", "training", "versions"}
+    assert results["method"] == "ficreg" and results["search"] == "cem"
+    for name in ("policy", "random"):
         assert results[name]["pairs"] == 4 and results[name]["budget"] == 50
         assert 0 <= results[name]["success_rate"] <= 1
-    assert results["ficreg"]["pairs_hash"] == results["random"]["pairs_hash"]
-    assert results["ficreg"]["seconds_per_plan"] > 0 == results["random"]["seconds_per_plan"]
+    assert results["policy"]["pairs_hash"] == results["random"]["pairs_hash"]
+    assert results["policy"]["seconds_per_plan"] > 0 == results["random"]["seconds_per_plan"]
     data = OfflineTrajectories(trained / DATA, split="train", num_frames=2, frame_skip=5, batch_size=32)
     assert results["training"]["steps"] == data.batches_per_epoch
     assert results["training"]["dataset_fingerprint"] == data.fingerprint
@@ -73,16 +74,18 @@ def test_evaluate_repeats_the_outcome_bit_for_bit(trained, copy, execute, files)
     before = files(copy)
     done = execute(copy, "evaluate.py", f"checkpoint={RUN}", "num_envs=3", "record=1")
     assert done.returncode == 0, done.stderr
-    repeated = json.loads((copy / RUN / "evaluation" / "results.json").read_text())
+    (folder,) = (copy / RUN / "evaluation").iterdir()
+    repeated = json.loads((folder / "results.json").read_text())
     expected = outcomes(trained / RUN)
-    assert expected.keys() >= {"ficreg", "random"}
-    for policy in ("ficreg", "random"):
+    assert expected.keys() >= {"policy", "random"}
+    for policy in ("policy", "random"):
         for key, value in expected[policy].items():
             assert repeated[policy][key] == value, (policy, key)
     assert repeated["plan"]["num_candidates"] == 20, "the plan settings of the run hold unless others are typed"
     after = files(copy)
     new = {name for name in after if name not in before}
-    assert new == {f"{RUN}/evaluation/results.json", f"{RUN}/evaluation/episodes.gif"}
+    names = ("config.yaml", "episodes.gif", "results.json")
+    assert new == {f"{RUN}/evaluation/{folder.name}/{name}" for name in names}
     assert all(after[name] == before[name] for name in before)
 
 
@@ -95,7 +98,7 @@ def test_a_finished_command_given_again_trains_nothing(copy, execute, files):
     unchanged = [name for name in before if name.startswith("checkpoints/") or name == "metrics.csv"]
     assert len(unchanged) == 2 and all(after[name] == before[name] for name in unchanged)
     results = json.loads(after["results.json"])
-    assert results["ficreg"]["pairs"] == 3
+    assert results["policy"]["pairs"] == 3
     assert results["training"]["resumed_at_step"] == results["training"]["steps"]
 
 
@@ -145,7 +148,7 @@ def test_lewm_trains_and_other_loggers_work(trained, execute, tmp_path, backend)
     run_dir = tmp_path / "runs" / "two_room_cpu_lewm_seed0"
     header = (run_dir / "metrics.csv").read_text().splitlines()[0]
     assert "loss_pred" in header and "loss_idm" not in header and "loss_consistency" not in header
-    assert "lewm" in json.loads((run_dir / "results.json").read_text())
+    assert json.loads((run_dir / "results.json").read_text())["method"] == "lewm"
     pattern = "events.out.*" if backend == "tensorboard" else "run-*.wandb"
     assert list((run_dir / backend).rglob(pattern))
     if backend == "wandb":

@@ -432,3 +432,24 @@ def test_a_complete_dataset_is_not_opened_for_writing(record, meta, monkeypatch)
     monkeypatch.setattr(os, "open", refused)
     with EpisodeWriter(path, target_episodes=2, meta=meta) as writer:
         assert writer.complete and writer.num_steps == 40
+
+
+def test_a_complete_dataset_with_a_wrong_shape_is_no_complete_dataset(record, meta):
+    path = record([20, 20], target=2)
+    notes = json.loads((path / "meta.json").read_text())
+    notes["shapes"]["pixels"] = [3, 4, 2]
+    (path / "meta.json").write_text(json.dumps(notes))
+    with pytest.raises(ValueError, match="checksum"):
+        EpisodeWriter(path, target_episodes=2, meta=meta)
+
+
+@pytest.mark.parametrize("frames", ["raw", "png"])
+def test_episodes_without_a_state_are_stored_and_opened(tmp_path, make_episode, meta, frames):
+    episode = {**make_episode(1), "state": np.zeros((20, 0))}
+    for target in (1, 2):  # opened anew in between
+        with EpisodeWriter(tmp_path, target_episodes=target, meta=meta, frames=frames) as writer:
+            writer.append(episode)
+    store = EpisodeStore.open(tmp_path, verify="full")
+    assert store.num_episodes == 2 and store.arrays["state"].shape == (40, 0)
+    with pytest.raises(ValueError, match="holds no state"):
+        store.require_state()

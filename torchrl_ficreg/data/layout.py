@@ -160,7 +160,9 @@ def _is_count(value: Any) -> bool:
 
 
 def _is_shape(key: str, shape: Any) -> bool:
-    """Whether rows of ``key`` may have this shape: [3, H, W] pixels, [A] actions, [S] states."""
+    """Whether rows of ``key`` may have this shape: [3, H, W] pixels, [A] actions, [S] states, of which S may be 0."""
+    if key == STATE and shape == [0]:
+        return True
     if not isinstance(shape, list) or not all(_is_count(size) for size in shape) or prod(shape) >= _MOST:
         return False
     return len(shape) == 3 and shape[0] == 3 if key == PIXELS else len(shape) == 1

@@ -14,7 +14,6 @@ from torchrl_ficreg._utils import lock_file, NO_FOLLOW, read_bytes, require_regu
 from torchrl_ficreg.data.frames import check_frame_format, encode_frames, FrameFormat
 from torchrl_ficreg.data.layout import (
     BLOB,
-    check_sizes,
     checksums,
     DTYPES,
     Header,
@@ -117,7 +116,7 @@ class EpisodeWriter:
         if (self.path / META_FILE).exists():  # looked for before anything is created, let alone cut
             header, entries = self._read()
             if len(entries) >= self.target_episodes == header.target_episodes:
-                check_sizes(self.path, header, self.num_steps)
+                self._verified(header, entries)
                 return
         self.path.mkdir(parents=True, exist_ok=True)
         self._index = self._open(INDEX_FILE)
@@ -249,12 +248,17 @@ class EpisodeWriter:
             self.num_episodes, self.num_steps = entries[-1].episode, entries[-1].stop
         return header, entries
 
+    def _verified(self, header: Header, entries: list[IndexEntry]) -> EpisodeStore:
+        """The committed episodes, after the checksums of the first and the last were compared."""
+        store = EpisodeStore(header, entries, None, self.path, num_threads=self.num_threads)
+        for entry in {entries[0], entries[-1]}:
+            store.check_episode(entry)
+        return store
+
     def _resume(self) -> None:
         header, entries = self._read()  # once more, now that nobody else writes
         if entries:
-            store = EpisodeStore(header, entries, None, self.path, num_threads=self.num_threads)
-            for entry in {entries[0], entries[-1]}:
-                store.check_episode(entry)
+            store = self._verified(header, entries)
             if header.frames != "raw":
                 self._blob_bytes = store.blob_bytes
         self._header = header

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-from ficreg_gpu_report import finished, read_metrics, read_results, Runs
+from ficreg_gpu_report import finished, planned, read_metrics, read_results, Runs
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
-from summarize import planned
 
 COLORS = {"lewm": "tab:gray", "ficreg": "tab:blue"}
 

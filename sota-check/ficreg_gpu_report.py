@@ -8,10 +8,14 @@ import os
 from pathlib import Path
 from typing import Any
 
-from summarize import planned
-
 Runs = dict[tuple[str, str], Path]  # environment and method -> folder of the run
 Results = dict[tuple[str, str], dict[str, Any]]
+
+
+def planned(result: dict) -> tuple[str, dict]:
+    """The method of a ``results.json`` and what its planner reached; earlier ones are keyed by the method's name."""
+    method = result.get("method") or next(key for key in result if key in ("ficreg", "lewm", "joint_inverse", "pldm"))
+    return method, result["policy"] if "policy" in result else result[method]
 
 
 def write_report(out: Path, runs: Runs, facts: dict[str, Any]) -> None:

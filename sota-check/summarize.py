@@ -7,6 +7,8 @@ import json
 import sys
 from pathlib import Path
 
+from ficreg_gpu_report import planned
+
 from torchrl_ficreg.evaluation import wilson_interval
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
@@ -18,12 +20,6 @@ KEPT = (
     "success_rate_unsolved_at_start",
     "seconds_per_plan",
 )
-
-
-def planned(result: dict) -> tuple[str, dict]:
-    """The method of a ``results.json`` and what its planner reached; earlier ones are keyed by the method's name."""
-    method = result.get("method") or next(key for key in result if key in ("ficreg", "lewm", "joint_inverse", "pldm"))
-    return method, result["policy"] if "policy" in result else result[method]
 
 
 def main(name: str, pattern: str) -> None:

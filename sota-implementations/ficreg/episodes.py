@@ -17,7 +17,7 @@ from torchrl_ficreg.data import EpisodeWriter, estimate_bytes, OfflineTrajectori
 from torchrl_ficreg.data.layout import META_FILE
 from torchrl_ficreg.data.schema import STATE
 from torchrl_ficreg.data.shards import open_store, shard_paths
-from torchrl_ficreg.data.space import require_space
+from torchrl_ficreg.data.space import nearest_folder, require_space
 from torchrl_ficreg.data.splits import split_episodes, SPLITS
 from torchrl_ficreg.envs import collect_episodes, make_env
 from torchrl_ficreg.envs.base import GOAL_STATE
@@ -141,14 +141,6 @@ def make_dataset(cfg: DictConfig, path: Path, split: str, **changes: Any) -> Off
         "pin_memory": True,  # where there is a CUDA device
     }
     return OfflineTrajectories(path.absolute(), **{**settings, **changes})
-
-
-def nearest_folder(path: Path) -> Path:
-    """A folder, or the nearest one there is above it."""
-    place = path.absolute()
-    while not place.exists() and place != place.parent:
-        place = place.parent
-    return place
 
 
 def is_writable(path: Path) -> bool:

@@ -26,10 +26,9 @@ from utils import (
     settings_of_card,
     versions,
     write_json,
-    write_text,
 )
 
-from torchrl_ficreg._utils import read_json
+from torchrl_ficreg._utils import read_json, write_atomic
 from torchrl_ficreg.evaluation import save_episodes_gif, StartGoalPairs
 from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_model
 
@@ -94,7 +93,7 @@ def evaluate(cfg: DictConfig) -> None:
     # Before anything is written: a full disk shall not cost the numbers.
     show({folder.name: results, **read_others(parent, folder.name)})
     resolved = {**OmegaConf.to_container(cfg), "budget": budget, "plan": settings["plan"]}
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(resolved)))
+    write_atomic(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(resolved)))
     write_json(folder / RESULTS, results)
     if cfg.record:
         save_episodes_gif(outcome, folder / "episodes.gif")

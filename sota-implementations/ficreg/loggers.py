@@ -9,8 +9,9 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 from torchrl.record.loggers import get_logger, Logger
-from utils import flatten, write_text
+from utils import flatten
 
+from torchrl_ficreg._utils import write_atomic
 from torchrl_ficreg.trainers import TolerantLogger
 
 PICTURES = ("learning_curve.png", "latent_distance.png")
@@ -55,7 +56,7 @@ def _run_id(run_dir: Path) -> str:
     path = run_dir / "wandb" / "run_id"
     if not path.exists():
         path.parent.mkdir(exist_ok=True)
-        write_text(path, secrets.token_hex(4))
+        write_atomic(path, secrets.token_hex(4))
     return path.read_text()
 
 

@@ -11,9 +11,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointRotation
-from utils import flatten, write_text
+from utils import flatten
 
-from torchrl_ficreg._utils import lock_file
+from torchrl_ficreg._utils import lock_file, write_atomic
 from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, find_checkpoint, read_card
 from torchrl_ficreg.trainers.offline import METRICS
 
@@ -155,7 +155,7 @@ def claim_run_dir(cfg: DictConfig) -> Path:
         raise RuntimeError(f"another process is at work in {run_dir}: wait for it, or give another name=...") from error
     settings = OmegaConf.to_container(cfg, resolve=True)
     settings[_FROM_RUN_DIR] = _from_run_dir(settings, run_dir)
-    write_text(run_dir / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(settings)))
+    write_atomic(run_dir / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(settings)))
     overrides = " ".join(HydraConfig.get().overrides.task) if HydraConfig.initialized() else f"name={cfg.name} ..."
-    write_text(run_dir / README, _README.format(name=cfg.name, overrides=overrides, run_dir=f"{cfg.runs_dir}/{cfg.name}"))
+    write_atomic(run_dir / README, _README.format(name=cfg.name, overrides=overrides, run_dir=f"{cfg.runs_dir}/{cfg.name}"))
     return run_dir

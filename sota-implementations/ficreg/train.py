@@ -21,7 +21,7 @@ from pathlib import Path
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # huge pages for large tensors on CPUs: torch looks when it starts
 import torch
 from cli import entry_point
-from episodes import check_writable, find_dataset, is_writable, make_dataset, nearest_folder
+from episodes import check_writable, find_dataset, is_writable, make_dataset
 from loggers import make_logger, publish
 from omegaconf import DictConfig
 from planning import make_policy
@@ -45,6 +45,7 @@ from utils import (
 
 from torchrl_ficreg import InverseDynamicsModel, LatentWorldModel, make_world_model
 from torchrl_ficreg.data.latents import encode_episodes, LatentClips
+from torchrl_ficreg.data.space import nearest_folder
 from torchrl_ficreg.evaluation import (
     evaluate_mpc,
     latent_distance,

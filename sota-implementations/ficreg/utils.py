@@ -332,14 +332,9 @@ def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def write_text(path: Path, text: str) -> None:
-    """Writes a file in one piece, never through a link."""
-    write_atomic(path, text)
-
-
 def write_json(path: Path, values: dict[str, Any]) -> None:
     """Writes strict JSON in one piece; a NaN or an infinity becomes null."""
-    write_text(path, json.dumps(_finite(values), indent=2, allow_nan=False) + "\n")
+    write_atomic(path, json.dumps(_finite(values), indent=2, allow_nan=False) + "\n")
 
 
 def _finite(tree: Any) -> Any:

@@ -9,6 +9,14 @@ _RESERVE = 256 * 2**20  # most bytes left alone: logs, checkpoints, the rest of 
 _RESERVED_PART = 0.02  # and no more than this part of a small disk
 
 
+def nearest_folder(path: Path) -> Path:
+    """A folder, or the nearest one there is above it."""
+    place = path.absolute()
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    return place
+
+
 def require_space(path: str | Path, num_bytes: int) -> None:
     """Checks that a folder, which need not exist yet, can take so many bytes more.
 
@@ -22,9 +30,7 @@ def require_space(path: str | Path, num_bytes: int) -> None:
     Examples:
         >>> require_space("somewhere/new", 1)
     """
-    place = Path(path).expanduser().absolute()
-    while not place.exists():
-        place = place.parent
+    place = nearest_folder(Path(path).expanduser())
     total, _, free = shutil.disk_usage(place)
     reserve = min(_RESERVE, int(total * _RESERVED_PART))
     if num_bytes + reserve > free:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import secrets
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from torchrl_ficreg._utils import write_atomic
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.data.schema import STATE
 
@@ -142,14 +141,7 @@ class StartGoalPairs:
         """
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
-        try:
-            with open(part, "x") as file:  # never through a link
-                json.dump({**self._content(), "hash": self.hash}, file, indent=1)
-            os.replace(part, path)
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
+        write_atomic(path, json.dumps({**self._content(), "hash": self.hash}, indent=1))
 
     @classmethod
     def load(cls, path: Path) -> StartGoalPairs:

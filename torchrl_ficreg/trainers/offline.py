@@ -270,6 +270,7 @@ class OfflineTrainer(Trainer):
         if self.step == end:
             self.kept.parent.mkdir(parents=True, exist_ok=True)
             part = self.kept.with_name(f".{self.kept.name}.part")
+            part.unlink(missing_ok=True)  # of a process that was killed, or a link, through which nothing is written
             shutil.copyfile(checkpoint, part)
             os.replace(part, self.kept)
 

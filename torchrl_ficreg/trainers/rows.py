@@ -11,6 +11,8 @@ from typing import Any
 
 from torchrl import torchrl_logger
 
+from torchrl_ficreg._utils import write_atomic
+
 
 class CsvRows:
     """Appends rows to a CSV file. A row may bring new columns: the file is then rewritten, in one piece, with them.
@@ -70,13 +72,7 @@ class CsvRows:
         return self._columns if self.path.exists() else None
 
     def _replace(self, columns: list[str], rows: list[dict[str, Any]]) -> None:
-        part = self.path.with_suffix(".part")
-        try:
-            with open(part, "w", newline="") as file:
-                file.write(_lines(columns, [dict(zip(columns, columns)), *rows]))
-            os.replace(part, self.path)
-        finally:
-            part.unlink(missing_ok=True)
+        write_atomic(self.path, _lines(columns, [dict(zip(columns, columns)), *rows]))
 
     def drop_after(self, step: int) -> None:
         """Removes whole rows of later steps, and torn ones of any, in one piece."""

@@ -65,8 +65,7 @@ def constant_components(world_model: LatentWorldModel, bounds: Bounds | None) ->
         [A] bool, on the CPU.
     """
     mean, std = _moments(world_model)
-    flagged = getattr(world_model.statistics, "constant", None)
-    constant = torch.zeros_like(mean, dtype=torch.bool) if flagged is None else flagged.cpu()
+    constant = world_model.statistics.constant.cpu()
     if bounds is None:
         return constant
     low, high = bounds

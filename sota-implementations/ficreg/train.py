@@ -54,6 +54,7 @@ from torchrl_ficreg.evaluation import (
     save_episodes_gif,
     StartGoalPairs,
 )
+from torchrl_ficreg.modules.precision import describe_precision
 from torchrl_ficreg.trainers import (
     checkpoint_components,
     load_world_model,
@@ -104,6 +105,8 @@ def train(
 ) -> tuple[LatentWorldModel, InverseDynamicsModel, ModelCard, dict]:
     """Trains, or continues, and returns the networks to be evaluated, in eval mode. Processes part before that."""
     with process_group(get_device(cfg.device)) as device:
+        if is_main():
+            print(f"training on {describe_precision(device, cfg.optim.precision)}")
         torch.manual_seed(cfg.seed)
         clips = make_dataset(cfg, data, "train", prefetch=1, part=(rank(), world_size()))
         held_out = make_dataset(cfg, data, "validation", drop_last=False, part=(rank(), world_size()))

@@ -27,7 +27,7 @@ from torchrl_ficreg import LatentWorldModel
 from torchrl_ficreg.data.latents import BLOCKS, encode_episodes, GoalRows
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.goal_policy import GoalPolicy, load_goal_policy, save_goal_policy
-from torchrl_ficreg.modules.precision import autocast, uses_bf16
+from torchrl_ficreg.modules.precision import autocast, check_precision
 from torchrl_ficreg.modules.safe_files import require_safetensors
 from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_model, ModelCard, WarmupCosine
 
@@ -191,7 +191,7 @@ def check_settings(cfg: DictConfig) -> None:
         raise ValueError(f"must not be negative nor exceed 63 bits: {', '.join(wrong)}.")
     if not 0 <= optim.warmup < 1:
         raise ValueError(f"optim.warmup must lie in [0, 1), got {optim.warmup}.")
-    uses_bf16("cpu", optim.precision)
+    check_precision(optim.precision)
     get_device(cfg.device)
     require_safetensors()
 

@@ -41,7 +41,7 @@ from torchrl_ficreg.data.frames import check_frame_format
 from torchrl_ficreg.envs import make_env
 from torchrl_ficreg.evaluation import Evaluation, evaluate_mpc, StartGoalPairs, UniformPolicy
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
-from torchrl_ficreg.modules.precision import autocast, Precision, uses_bf16
+from torchrl_ficreg.modules.precision import autocast, check_precision, describe_processor, Precision
 from torchrl_ficreg.modules.recompute import checkpoint_activations
 from torchrl_ficreg.trainers import CoefficientSchedule, LatentAlarm, ModelCard, OfflineTrainer, Refinement
 from torchrl_ficreg.trainers.distributed import launched, world_size
@@ -273,7 +273,7 @@ def check_settings(cfg: DictConfig, training: bool = True) -> None:
     if not 0 <= optim.warmup < 1:
         raise ValueError(f"optim.warmup must lie in [0, 1), got {optim.warmup}.")
     for precision in (optim.precision, cfg.plan.precision):
-        uses_bf16("cpu", precision)
+        check_precision(precision)
     parts = optim.accumulate
     local = optim.batch_size // _num_processes()
     if parts < 1 or parts > 1 and local % (2 * parts):
@@ -438,4 +438,5 @@ def versions() -> dict[str, str]:
         "numpy": _version("numpy"),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads",
+        "processor": describe_processor(),
     }

@@ -1,7 +1,7 @@
 """Linear layers and attention whose training step is cheap on CPUs: same numbers, fewer passes over memory.
 
-On a GPU, torch's own fused kernels are faster and these step aside. So they do for inference, and while
-``torch.compile`` traces. Shapes: N sequences, T tokens, C channels.
+Where torch's own kernels are as fast, these step aside: on GPUs, while ``torch.compile`` traces, for inference in float32,
+and, for linear layers, on processors without AMX. Shapes: N sequences, T tokens, C channels.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
+from torchrl_ficreg.modules.precision import has_amx
+
 MANY = 1024  # rows from which the sum over them, for the gradient of a bias, is worth a matrix product
 CACHED = 4 * 2**20  # bytes of attention weights worked on at once: more do not stay in the cache
 
@@ -22,11 +24,18 @@ def trains_on_cpu(x: torch.Tensor) -> bool:
     return x.device.type == "cpu" and torch.is_grad_enabled() and not torch.compiler.is_compiling()
 
 
+def suits_packed_attention(packed: torch.Tensor) -> bool:
+    """Whether :func:`packed_attention` is the fastest: on CPUs, in training and in bfloat16."""
+    on_cpu = packed.device.type == "cpu" and not torch.compiler.is_compiling()
+    return on_cpu and (torch.is_grad_enabled() or packed.dtype == torch.bfloat16)
+
+
 def linear(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
-    """``F.linear``, cheaper in training on CPUs under autocast: [..., C] -> [..., out].
+    """``F.linear``, cheaper in training on CPUs with AMX under autocast: [..., C] -> [..., out].
 
     torch copies the bias to every row before a product, and sums the rows of a bfloat16 gradient at a third of the
-    speed at which a product with a row of ones does; both sums are made in float32.
+    speed at which a product with a row of ones does; both sums are made in float32. Without AMX the products take so
+    long that nothing is gained.
 
     Args:
         x: [..., C].
@@ -34,7 +43,7 @@ def linear(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> 
         bias: [out], or None.
     """
     fits = bias is not None and weight.requires_grad and x.numel() >= MANY * x.shape[-1]
-    if fits and trains_on_cpu(x) and torch.is_autocast_enabled("cpu"):
+    if fits and has_amx() and trains_on_cpu(x) and torch.is_autocast_enabled("cpu"):
         return _Linear.apply(x, weight, bias, torch.get_autocast_dtype("cpu"))
     return F.linear(x, weight, bias)
 

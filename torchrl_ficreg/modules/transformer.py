@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from torchrl_ficreg.modules.kernels import linear, Linear, packed_attention, trains_on_cpu
+from torchrl_ficreg.modules.kernels import linear, Linear, packed_attention, suits_packed_attention
 
 Cache = tuple[torch.Tensor, torch.Tensor]  # keys and values, each [N, heads, T, dim_head]
 
@@ -23,9 +23,9 @@ def attend(
 ) -> torch.Tensor:
     """Softmax attention by the kernel that is fastest on the device at hand.
 
-    The fused kernel wins on CUDA. On CPUs its backward pass costs twice that of two plain matrix products around
-    a softmax, so these are used there in training; the windows of a few tokens that a planner imagines by the thousand
-    are cheaper still without any matrix product.
+    The fused kernel wins on GPUs, and on CPUs in float32 where no gradient is wanted. In training on CPUs, and in
+    bfloat16, it costs up to three times two plain matrix products around a softmax; the windows of a few tokens that
+    a planner imagines by the thousand are cheaper still without any matrix product.
 
     Args:
         query: [N, heads, Q, dim_head], any floating dtype.
@@ -36,10 +36,12 @@ def attend(
     Returns:
         [N, heads, Q, dim_head].
     """
-    if query.device.type != "cpu":
-        return F.scaled_dot_product_attention(query, key, value, is_causal=causal, dropout_p=dropout)
-    if key.shape[-2] <= FEW and not dropout and not (torch.is_grad_enabled() and query.requires_grad):
+    infers = not dropout and not (torch.is_grad_enabled() and query.requires_grad)
+    on_cpu = query.device.type == "cpu"
+    if on_cpu and infers and key.shape[-2] <= FEW:
         return _attend_to_few(query, key, value, causal)
+    if not on_cpu or (infers and query.dtype == torch.float32):
+        return F.scaled_dot_product_attention(query, key, value, is_causal=causal, dropout_p=dropout)
     scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)  # [N, heads, Q, T]
     if causal:
         tokens = scores.shape[-1]
@@ -105,7 +107,7 @@ class Attention(nn.Module):
             mixed = F.linear(x, self.to_qkv.weight[2 * self.inner :], bias)  # [N, 1, inner]
         else:
             packed = self.to_qkv(x)  # [N, T, 3 * inner]
-            if trains_on_cpu(packed) and not self.causal and not drop:
+            if suits_packed_attention(packed) and not self.causal and not drop:
                 mixed = packed_attention(packed, self.heads)
             else:
                 mixed = attend(*self._heads(packed, 3).unbind(0), self.causal, drop).transpose(1, 2).flatten(2)

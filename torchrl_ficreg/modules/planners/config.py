@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import Literal
 
-from torchrl_ficreg.modules.precision import Precision, uses_bf16
+from torchrl_ficreg.modules.precision import check_precision, Precision
 
 _LARGEST_COUNT = 10**6  # of candidates, iterations, blocks and proposals: a slip of the keyboard beyond
 
@@ -70,7 +70,7 @@ class PlanConfig:
         for name, choices in (("bounds", ("environment", "none")), ("history", ("context", "one_frame"))):
             if getattr(self, name) not in choices:
                 raise ValueError(f"unknown {name} {getattr(self, name)!r}: choose {choices[0]!r} or {choices[1]!r}.")
-        uses_bf16("cpu", self.precision)  # refuses an unknown one
+        check_precision(self.precision)  # refuses an unknown one
 
 
 @dataclass(frozen=True)

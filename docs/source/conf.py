@@ -7,4 +7,5 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 exclude_patterns = ["gradient_flow.rst"]  # included by nutshell.rst
 html_theme = "alabaster"
+html_theme_options = {"page_width": "1240px", "body_max_width": "none"}  # for tables of seven columns and long commands
 nitpicky = False

@@ -40,6 +40,9 @@ results.json          success rates with their intervals, what training took, ve
 episodes.gif          rollouts of the planner
 learning_curve.png    losses against steps
 latent_distance.png   distance in latent space against true distance
+evaluation/           what evaluate.py found, a folder <search>_<hash of its settings> each: results.json, config.yaml and
+                      episodes.gif
+goal_policy/          what train_policy.py made
 wandb/, tensorboard/  files of the logger, where one was asked for
 """
 

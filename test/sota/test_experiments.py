@@ -51,6 +51,17 @@ def test_the_published_code_is_run_to_the_letter(experiment, context, env):
     assert [list(goal) for goal in cfg.evaluation.also] == ([[100, 150]] if env == "two_room" else [])
 
 
+@pytest.mark.parametrize("other", ["model=paper", "experiment=ficreg"])
+def test_every_setting_in_which_the_published_code_stands_apart_is_in_the_tables(other):
+    docs = CONFIG.parents[2] / "docs" / "source"
+    tables = "".join((docs / name).read_text() for name in ("scaling.rst", "planning.rst"))
+    for env in ENVIRONMENTS:
+        ours, theirs = (config(choice, f"env={env}") for choice in ("experiment=ficreg_paper", other))
+        for group in set(ours) - {"name"}:
+            for field in ours[group] if isinstance(ours[group], DictConfig) else ():
+                assert ours[group][field] == theirs[group][field] or f"{group}.{field}" in tables, f"{group}.{field}"
+
+
 def test_the_command_line_narrows_it_down():
     assert len(runs("experiment=ficreg_paper", "env=push_t", "seed=0,1")) == 2
 

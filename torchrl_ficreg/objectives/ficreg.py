@@ -40,7 +40,8 @@ class FICRegLoss(LeWMLoss):
 
     Algorithm 1 of the paper, taken literally, breaks the last row: its one prediction is made from live latents, so the
     consistency term reaches the encoder through the predictor's input. ``context="detached"`` keeps the table exactly,
-    by a second prediction from detached latents; ``context="live"`` is Algorithm 1 to the letter.
+    by a second prediction from detached latents; ``context="live"`` is Algorithm 1 to the letter, and what the authors' code
+    does.
 
     The clip is that of :class:`LeWMLoss`. All random draws of the baseline terms come first, so that under one seed
     the encoder's gradient equals that of :class:`LeWMLoss` to the last bit.

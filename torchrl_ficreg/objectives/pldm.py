@@ -25,7 +25,9 @@ class PLDMLoss(LatentLoss):
     and penalty on covariances (arXiv 2105.04906) over the batch, at every time step; ``loss_time_var`` and
     ``loss_time_cov`` the same over the time steps of every clip; ``loss_time_sim`` the squared difference of successive
     latents; ``loss_idm`` the error of an inverse model trained with the encoder. Names and Greek letters are those of
-    appendix C.2 of the LeWorldModel paper (arXiv 2603.19312); covariances are squared, as in VICReg.
+    appendix C.2 of the LeWorldModel paper (arXiv 2603.19312); covariances are squared, as in VICReg, and their sum is divided by
+    D. The published code of PLDM divides by D (D - 1), centres the latents over the batch before the terms over time, and has
+    other weights: a published weight of the covariance belongs to a term D - 1 times as small.
 
     ====================  =======  =========  =============
     term                  encoder  predictor  inverse model

@@ -1,4 +1,4 @@
-"""Everybody's data: episodes of other projects, turned into datasets of this one."""
+"""Episodes of other projects, turned into datasets of this one."""
 
 from __future__ import annotations
 

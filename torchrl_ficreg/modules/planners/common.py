@@ -38,7 +38,7 @@ class LatentPlanner(MPCPlannerBase):
 
     Every environment draws from a generator of its own, so its plan is the same alone or among fifty, up to the float
     kernels: environments are imagined in groups, on CPUs of 512 candidates in all. With 257 candidates or more, that is
-    environment by environment, and a plan on a CPU is the same to the last bit in any company.
+    environment by environment, and a plan on a CPU is the same to the last bit whatever is planned beside it.
 
     An action component that never changed in the training data stays at its mean in every candidate, as does one whose
     bounds are equal. A model cast to another dtype is rolled out in that dtype unless ``config.precision`` is

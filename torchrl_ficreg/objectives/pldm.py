@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch, TensorDictModule
+from tensordict.nn import TensorDictModule
 
-from torchrl_ficreg.objectives.base import LatentLoss, Reduction
+from torchrl_ficreg.objectives.base import LatentLoss, Reduction, takes_clip
 from torchrl_ficreg.objectives.gather import gather_clips
 from torchrl_ficreg.objectives.judge import inverse_error
 from torchrl_ficreg.objectives.terms import hinge_std, off_diagonal_covariance, squared_error
@@ -57,6 +57,7 @@ class PLDMLoss(LatentLoss):
         idm_coeff: mu, of the inverse model.
         std_margin: standard deviation asked for.
         reduction: over transitions; the statistics are one number either way.
+        num_frames: see :class:`~torchrl_ficreg.LeWMLoss`.
 
     Raises:
         KeyError, ValueError, TypeError: see :class:`~torchrl_ficreg.LeWMLoss`.
@@ -69,7 +70,7 @@ class PLDMLoss(LatentLoss):
         >>> loss = PLDMLoss(model.encoder, model.predictor, inverse_model)
         >>> pixels = torch.randint(0, 256, (8, 2, 3, 64, 64), dtype=torch.uint8)
         >>> output = loss(TensorDict({"pixels": pixels, "action": torch.randn(8, 2, 10)}, [8, 2]))
-        >>> sum(output.values()).backward()
+        >>> sum(value for key, value in output.items() if key.startswith("loss_")).backward()
         >>> sorted(output.keys())
         ['loss_cov', 'loss_idm', 'loss_pred', 'loss_time_sim', 'loss_time_var', 'loss_var']
     """
@@ -94,8 +95,15 @@ class PLDMLoss(LatentLoss):
         idm_coeff: float = 1.0,
         std_margin: float = 1.0,
         reduction: Reduction = "mean",
+        num_frames: int | None = None,
     ) -> None:
-        super().__init__(reduction=reduction, encoder=encoder, predictor=predictor, inverse_model=inverse_model)
+        super().__init__(
+            reduction=reduction,
+            num_frames=num_frames,
+            encoder=encoder,
+            predictor=predictor,
+            inverse_model=inverse_model,
+        )
         coefficients = {
             "var_coeff": var_coeff,
             "cov_coeff": cov_coeff,
@@ -111,7 +119,7 @@ class PLDMLoss(LatentLoss):
         used = {f"loss_{name.removesuffix('_coeff')}" for name, value in coefficients.items() if value > 0}
         self.out_keys = [key for key in _TERMS if key == "loss_pred" or key in used]
 
-    @dispatch
+    @takes_clip
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
         clip = self._read(tensordict)

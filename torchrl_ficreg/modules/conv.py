@@ -6,6 +6,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import nn
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 from torchrl_ficreg.data.schema import LATENT, PIXELS
 from torchrl_ficreg.modules.pixels import PixelNormalizer, restore_lead
@@ -44,7 +45,9 @@ class ConvNetwork(nn.Module):
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         """[..., 3, H, W] -> [..., D]."""
-        frames = self.normalize(pixels).contiguous(memory_format=torch.channels_last)  # [N, 3, H, W]
+        frames = self.normalize(pixels)  # [N, 3, H, W]
+        if torch.compiler.is_compiling() or not is_functorch_wrapped_tensor(frames):  # vmap knows no such layout
+            frames = frames.contiguous(memory_format=torch.channels_last)
         return restore_lead(self.projector(self.convolutions(frames).flatten(1)), pixels)
 
 

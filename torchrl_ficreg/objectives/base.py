@@ -126,9 +126,18 @@ class LatentLoss(LossModule):
     def named_parameters(
         self, prefix: str = "", recurse: bool = True, remove_duplicate: bool = True
     ) -> Iterator[tuple[str, nn.Parameter]]:
-        """As torch's, whose ``remove_duplicate`` :func:`torch.func.functional_call` asks for."""
-        named = nn.Module.named_parameters(self, prefix, recurse, remove_duplicate)
-        return ((name, param) for name, param in named if not name.startswith("_target"))
+        """As TorchRL's.
+
+        Raises:
+            TypeError: with ``remove_duplicate=False``, as :func:`torch.func.functional_call` asks, which replaces no
+                parameter of a functional loss.
+        """
+        if not remove_duplicate:
+            raise TypeError(
+                "torch.func.functional_call does not reach the parameters of a TorchRL loss: write `with "
+                "TensorDict(params).unflatten_keys('.').to_module(loss): loss(clip)` instead."
+            )
+        return super().named_parameters(prefix, recurse)
 
     def _read(self, tensordict: TensorDictBase) -> Clip:
         keys = self.tensor_keys

@@ -33,8 +33,10 @@ class LeWMLoss(LatentLoss):
     Writes a new tensordict: ``loss_pred`` and ``loss_sigreg``, already weighted. The sum of all entries that begin with
     ``loss_`` is the objective.
 
-    :func:`torch.func.functional_call` takes the parameters and buffers that the loss itself names. :func:`torch.vmap`
-    over data needs ``eval()`` where networks hold BatchNorm or dropout, as for any module; values are not checked there.
+    To call it with other parameters, use ``with TensorDict(params).unflatten_keys(".").to_module(loss)``, where ``params``
+    holds all names of ``loss.named_parameters()``; :func:`torch.func.functional_call` is refused, as it does not reach
+    them. :func:`torch.vmap` over data needs ``eval()`` where networks hold BatchNorm or dropout, as for any module;
+    values are not checked there.
 
     Args:
         encoder: reads ``pixels``, writes ``latent`` [..., D].

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_ficreg.data.schema import ACTION, LATENT, PIXELS, PREDICTED_LATENT
 from torchrl_ficreg.data.statistics import ActionStatistics
-from torchrl_ficreg.modules.feed import choose_output, feed, read_output
+from torchrl_ficreg.modules.feed import arrange, choose_output, feed, Names, read_output
 from torchrl_ficreg.modules.predictor import CausalPredictor
 
 
@@ -44,6 +44,7 @@ class LatentWorldModel(TensorDictModuleBase):
         statistics: ActionStatistics | None = None,
     ) -> None:
         super().__init__()
+        arrange("predictor", predictor.in_keys, self._names(encoder))
         block = predictor.module.action_dim
         if block % frame_skip:
             raise ValueError(f"an action block of width {block} is no multiple of frame_skip {frame_skip}.")
@@ -91,9 +92,14 @@ class LatentWorldModel(TensorDictModuleBase):
 
     def predict(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Latents [..., T, D] and the z-scored action blocks leading on [..., T, F * A] -> next latents [..., T, D]."""
-        names = {LATENT: (choose_output(self.encoder, LATENT) or LATENT,)}
-        written = self.predictor(feed("predictor", self.predictor, {LATENT: latent, ACTION: action}, names))
+        inputs = {LATENT: latent, ACTION: action}
+        written = self.predictor(feed("predictor", self.predictor, inputs, self._names(self.encoder)))
         return read_output(self.predictor, written, PREDICTED_LATENT, -1)
+
+    @staticmethod
+    def _names(encoder: TensorDictModuleBase) -> Names:
+        """What the predictor may call its inputs beside their contract names."""
+        return {LATENT: (choose_output(encoder, LATENT) or LATENT,), ACTION: ()}
 
     def rollout(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Imagines where a sequence of action blocks leads, feeding predictions back.

@@ -23,9 +23,12 @@ class PLDMLoss(LatentLoss):
 
     ``loss_pred`` is that of LeWorldModel. ``loss_var`` and ``loss_cov`` are VICReg's hinge on the standard deviation
     and penalty on covariances (arXiv 2105.04906) over the batch, at every time step; ``loss_time_var`` and
-    ``loss_time_cov`` the same over the time steps of every clip; ``loss_time_sim`` the squared difference of successive
-    latents; ``loss_idm`` the error of an inverse model trained with the encoder. Names and Greek letters are those of
-    appendix C.2 of the LeWorldModel paper (arXiv 2603.19312); covariances are squared, as in VICReg.
+    ``loss_time_cov`` the same over the time steps of every clip, from which the mean over the batch is subtracted at every
+    time step and no mean over time; ``loss_time_sim`` the squared difference of successive latents; ``loss_idm`` the error
+    of an inverse model trained with the encoder. Names and Greek letters are those of appendix C.2 of the LeWorldModel
+    paper (arXiv 2603.19312). Normalisation and default weights are those of the published code (stable-worldmodel, the
+    baseline of that paper): covariances are squared, as in VICReg, and averaged over the D² - D entries off the diagonal;
+    the weights belong to D = 192.
 
     ====================  =======  =========  =============
     term                  encoder  predictor  inverse model
@@ -48,13 +51,13 @@ class PLDMLoss(LatentLoss):
 
     Args:
         encoder, predictor: see :class:`~torchrl_ficreg.LeWMLoss`.
-        inverse_model: see :class:`~torchrl_ficreg.FICRegLoss`.
+        inverse_model: see :class:`~torchrl_ficreg.FICRegLoss`; used where ``idm_coeff`` is positive.
         var_coeff: alpha, of the variance over the batch.
         cov_coeff: beta, of the covariance over the batch.
         time_sim_coeff: gamma, of temporal similarity.
         time_var_coeff: zeta, of the variance over time; needs clips of 2 frames or more.
         time_cov_coeff: nu, of the covariance over time.
-        idm_coeff: mu, of the inverse model.
+        idm_coeff: mu, of the inverse model; the published weight is 0.
         std_margin: standard deviation asked for.
         reduction: over transitions; the statistics are one number either way.
         num_frames: see :class:`~torchrl_ficreg.LeWMLoss`.
@@ -72,7 +75,7 @@ class PLDMLoss(LatentLoss):
         >>> output = loss(TensorDict({"pixels": pixels, "action": torch.randn(8, 2, 10)}, [8, 2]))
         >>> sum(value for key, value in output.items() if key.startswith("loss_")).backward()
         >>> sorted(output.keys())
-        ['loss_cov', 'loss_idm', 'loss_pred', 'loss_time_sim', 'loss_time_var', 'loss_var']
+        ['loss_cov', 'loss_pred', 'loss_time_sim', 'loss_time_var', 'loss_var']
     """
 
     out_keys = list(_TERMS)
@@ -87,12 +90,12 @@ class PLDMLoss(LatentLoss):
         predictor: TensorDictModule,
         inverse_model: TensorDictModule,
         *,
-        var_coeff: float = 1.0,
-        cov_coeff: float = 1.0,
-        time_sim_coeff: float = 1.0,
-        time_var_coeff: float = 1.0,
+        var_coeff: float = 18.0,
+        cov_coeff: float = 12.0,
+        time_sim_coeff: float = 0.2,
+        time_var_coeff: float = 0.7,
         time_cov_coeff: float = 0.0,
-        idm_coeff: float = 1.0,
+        idm_coeff: float = 0.0,
         std_margin: float = 1.0,
         reduction: Reduction = "mean",
         num_frames: int | None = None,
@@ -129,12 +132,14 @@ class PLDMLoss(LatentLoss):
         over_batch = gather_clips(latent.flatten(0, -3).transpose(0, 1), dim=1)  # [T, B of all processes, D]
         if over_batch.shape[1] < 2:
             raise ValueError("variance and covariance over the batch need at least 2 clips, got 1: use a larger batch.")
+        centred = latent - over_batch.mean(1)  # [B, T, D], without the mean of every time step
+        pairs = max(latent.shape[-1] - 1, 1)  # entries off the diagonal for each of the D that VICReg divides by
         compute = {
             "loss_var": lambda: hinge_std(over_batch, -2, self.std_margin).mean(),
-            "loss_cov": lambda: off_diagonal_covariance(over_batch).mean(),
+            "loss_cov": lambda: off_diagonal_covariance(over_batch).mean() / pairs,
             "loss_time_sim": lambda: self._reduce(squared_error(before, after).mean(-1), clip.mask),
-            "loss_time_var": lambda: hinge_std(latent, -2, self.std_margin).mean(),
-            "loss_time_cov": lambda: off_diagonal_covariance(latent).mean(),
+            "loss_time_var": lambda: hinge_std(centred, -2, self.std_margin).mean(),
+            "loss_time_cov": lambda: off_diagonal_covariance(centred, centre=False).mean() / pairs,
             "loss_idm": lambda: self._reduce(
                 inverse_error(self._recover(before, after, self.inverse_model_params), clip.action).mean(-1), clip.mask
             ),

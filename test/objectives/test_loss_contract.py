@@ -444,6 +444,16 @@ def test_networks_of_another_dtype_take_the_clips_as_they_are(loss, make_clip, d
     sum(output.values()).backward()
 
 
+@pytest.mark.parametrize("name", ["lewm", "paper", "joint", "pldm"])
+def test_a_loss_runs_on_a_device_without_numbers(make_loss, make_clip, name):
+    """On meta tensors, which know neither values nor autocast: terms of the right shape, with a gradient."""
+    with torch.device("meta"):
+        loss = make_loss(name)
+    output = loss(make_clip().to("meta"))
+    assert all(value.shape == () and value.device.type == "meta" for value in output.values())
+    sum(output.values()).backward()
+
+
 def test_unknown_choices_are_refused(networks):
     with pytest.raises(ValueError, match="unknown context 'dead': choose one of 'detached', 'live'"):
         FICRegLoss(*networks(), context="dead")

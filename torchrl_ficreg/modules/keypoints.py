@@ -10,6 +10,7 @@ from torch import nn
 from torchrl_ficreg.data.schema import LATENT, PIXELS
 from torchrl_ficreg.modules.batch_norm import GlobalBatchNorm1d
 from torchrl_ficreg.modules.pixels import PixelNormalizer, restore_lead
+from torchrl_ficreg.modules.precision import without_autocast
 
 _STRIDE = 4  # pixels between neighbouring places of a map
 
@@ -86,7 +87,7 @@ class KeypointNetwork(nn.Module):
         frames = self.normalize(pixels).contiguous(memory_format=torch.channels_last)  # [N, 3, H, W]
         maps = self.convolutions(frames)  # [N, K, H / 4, W / 4]
         # Places are known to a fraction of a pixel, which bfloat16 would round away.
-        with torch.autocast(pixels.device.type, enabled=False):
+        with without_autocast(pixels.device):
             places = self.norm(spatial_softmax(maps).to(self.layer_out.weight.dtype))  # [N, 2 K]
             return restore_lead(self.layer_out(places), pixels)
 

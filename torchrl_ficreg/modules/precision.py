@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Literal
 
 import torch
@@ -33,3 +34,15 @@ def uses_bf16(device: torch.device | str, precision: Precision = "auto") -> bool
 def autocast(device: torch.device | str, precision: Precision = "auto") -> torch.autocast:
     """A bfloat16 autocast region on the device where :func:`uses_bf16` says so, else a region that changes nothing."""
     return torch.autocast(torch.device(device).type, dtype=torch.bfloat16, enabled=uses_bf16(device, precision))
+
+
+def without_autocast(device: torch.device) -> AbstractContextManager:
+    """A region in which autocast is off, on devices that know none (meta) too."""
+    if not torch.amp.is_autocast_available(device.type):
+        return nullcontext()
+    return torch.autocast(device.type, enabled=False)
+
+
+def in_autocast(device: torch.device) -> bool:
+    """Whether autocast is on for a device."""
+    return torch.amp.is_autocast_available(device.type) and torch.is_autocast_enabled(device.type)

@@ -18,6 +18,7 @@ from torchrl_ficreg.data import schema
 from torchrl_ficreg.modules.collectives import num_processes, sum_over_processes
 from torchrl_ficreg.modules.feed import choose_output, feed, NEXT_LATENT
 from torchrl_ficreg.modules.inverse import LOG_VAR, SPREAD
+from torchrl_ficreg.modules.precision import in_autocast
 from torchrl_ficreg.objectives.clip import call, Clip, output, read_clip, read_frames
 from torchrl_ficreg.objectives.judge import Recovered
 
@@ -187,7 +188,7 @@ class LatentLoss(LossModule):
 
     def _predict(self, latent: torch.Tensor, action: torch.Tensor, params: TensorDictBase) -> torch.Tensor:
         """Latents and action blocks [B, T - 1, ...] -> next latents [B, T - 1, D]."""
-        if not torch.is_autocast_enabled(latent.device.type):
+        if not in_autocast(latent.device):
             action = action.to(latent.dtype)  # networks may compute in another dtype than the data
         return self._run("predictor", params, latent, action)[0]
 

@@ -368,7 +368,7 @@ def test_transitions_are_clips_of_two_frames(loss, make_clip):
 
 @pytest.mark.parametrize("batch", [{}, {"mask": torch.ones(8, 3, dtype=torch.bool)}])
 def test_a_plain_dict_is_told_to_become_a_tensordict(loss, make_clip, batch):
-    with pytest.raises(TypeError, match=r"a loss takes a TensorDict, so wrap a plain dict .* TensorDict\(batch"):
+    with pytest.raises(TypeError, match=r"a loss takes a TensorDict, no plain dict or list: wrap it as TensorDict\(batch"):
         loss({**make_clip(), **batch})
 
 

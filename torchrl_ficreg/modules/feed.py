@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import is_tensor_collection, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 
@@ -134,6 +134,19 @@ def _has(key: tuple[str, ...], mark: str) -> bool:
 def _parts(key: NestedKey) -> tuple[str, ...]:
     key = unravel_key(key)
     return (key,) if isinstance(key, str) else key
+
+
+def require_tensordict(owner: str, value: object) -> None:
+    """Refuses what is no tensordict, at the door of a module.
+
+    Raises:
+        TypeError: a dict, or anything else.
+    """
+    if not is_tensor_collection(value):
+        raise TypeError(
+            f"{owner} takes a TensorDict, got a {type(value).__name__}: wrap a dict of tensors as TensorDict(batch, "
+            "batch_size=[N])."
+        )
 
 
 def choose_output(module: TensorDictModuleBase, key: NestedKey) -> NestedKey | None:

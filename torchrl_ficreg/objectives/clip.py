@@ -157,8 +157,8 @@ def require(tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
         raise KeyError(f"the clip has no {key!r}, only {present}: rename it, or name it with loss.set_keys(...).")
     if not isinstance(value, torch.Tensor):
         raise TypeError(
-            f"{key!r} of the clip must be a tensor, got a {type(value).__name__}: a loss takes a TensorDict, so wrap a "
-            "plain dict of tensors as TensorDict(batch, batch_size=[B])."
+            f"{key!r} of the clip is no tensor but a {type(value).__name__}: a loss takes a TensorDict, no plain dict or "
+            "list: wrap it as TensorDict(batch, batch_size=[B])."
         )
     return value
 

@@ -24,7 +24,8 @@ class LeWMLoss(LatentLoss):
     block is not to be trusted: its transition, its action and the frame it leads to are left out of every term.
     BatchNorm layers still see that frame). Two other layouts of TorchRL are read as clips: flat slices [B * T], given
     ``num_frames``, and transitions [B] with ``("next", "pixels")``, which are clips of two frames. By keyword:
-    ``loss(pixels=, action=, mask=, next_pixels=)``, the last two optional.
+    ``loss(pixels=, action=, mask=, next_pixels=)``, the last two optional: ``in_keys`` lists what must be there, so name the
+    mask beside them where entries are selected.
 
     Networks are fed by the names of their ``in_keys``, in whatever order: ``latent`` or what the encoder writes,
     ``action``, and for an inverse model ``next_latent`` or ``("next", "latent")``; the last part of a nested key counts,

@@ -38,8 +38,9 @@ _SIGNATURES = {
 class LatentLoss(LossModule):
     """Base of the losses on clips. A subclass writes :meth:`forward` and its table of who receives gradient.
 
-    Networks are fed by the names of their ``in_keys``: see :func:`~torchrl_ficreg.modules.feed.arrange`. They are functional, as in TorchRL's losses: their parameters are children of the loss, they themselves are
-    not. Coefficients are buffers: ``loss.sigreg_coeff = 0.1`` neither recompiles nor rebuilds anything.
+    Networks are fed by the names of their ``in_keys``: see :func:`~torchrl_ficreg.modules.feed.arrange`. They are
+    functional, as in TorchRL's losses: their parameters are children of the loss, they themselves are not. Coefficients
+    are buffers: ``loss.sigreg_coeff = 0.1`` neither recompiles nor rebuilds anything.
     """
 
     @dataclass

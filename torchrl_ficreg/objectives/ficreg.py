@@ -62,8 +62,9 @@ class FICRegLoss(LeWMLoss):
             transition: predictions are then not rewarded for carrying more of the action than reality does, as at
             walls and contacts.
         consistency_steps: k; also judges imagined transitions 2 to k steps deep, each fed by predictions.
-        diagnostics: also write, detached and no part of the objective, ``judge_r2_real``, ``judge_r2_imagined`` and ``judge_r2_shuffled`` [F * A]
-            (:func:`~torchrl_ficreg.objectives.judge.judge_report`) and ``judge_trust`` [F * A], the mean weight.
+        diagnostics: also write, detached and no part of the objective, ``judge_r2_real``, ``judge_r2_imagined`` and
+            ``judge_r2_shuffled`` [F * A] (:func:`~torchrl_ficreg.objectives.judge.judge_report`) and ``judge_trust``
+            [F * A], the mean weight.
 
     Raises:
         KeyError, ValueError, TypeError: see :class:`LeWMLoss`; ValueError for an unknown choice, for ``"nll"`` without

@@ -29,7 +29,7 @@ LOSSES = {
     "FICRegLoss, transformer as judge": (FICRegLoss, "transformer", {}),
     "JointInverseLoss": (JointInverseLoss, "mlp", {}),
     "JointInverseLoss, sigreg_coeff=0": (JointInverseLoss, "mlp", {"sigreg_coeff": 0.0}),
-    "PLDMLoss": (PLDMLoss, "mlp", {"time_cov_coeff": 1.0}),
+    "PLDMLoss": (PLDMLoss, "mlp", {"time_cov_coeff": 1.0, "idm_coeff": 1.0}),
 }
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from torchrl_ficreg import GoalPolicy, PlanConfig
+from torchrl_ficreg import GoalPolicy, MPCPolicy, PlanConfig
 from torchrl_ficreg.modules.planners import SEARCHES
 
 UNIT = ([-1.0, -1.0], [1.0, 1.0])
@@ -88,3 +88,12 @@ def test_policies_that_are_missing_or_of_another_model_are_refused(tiny_world):
         make("policy", tiny_world(), policy=policy, num_proposals=0)
     with pytest.raises(ValueError, match="latents of 5 .* train a policy for this model"):
         make("cem", tiny_world(), policy=GoalPolicy(latent_dim=5, action_dim=4))
+
+
+def test_a_plain_dict_is_told_to_become_a_tensordict(tiny_world):
+    planner = make("cem", tiny_world(), cost=Untouched())
+    latent, frame = torch.zeros(2, 6), torch.zeros(2, 3, 16, 16, dtype=torch.uint8)
+    with pytest.raises(TypeError, match=r"a planner takes a TensorDict, got a dict: wrap .* TensorDict\(batch"):
+        planner({"latent": latent, "goal_latent": latent})
+    with pytest.raises(TypeError, match="MPCPolicy takes a TensorDict, got a dict"):
+        MPCPolicy(planner)({"pixels": frame, "goal_pixels": frame})

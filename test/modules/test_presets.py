@@ -43,7 +43,9 @@ def test_the_inverse_model_is_an_mlp_of_width_512(paper):
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_is_the_model_section_of_its_recipe(name):
-    recipe = OmegaConf.to_container(OmegaConf.load(RECIPES / f"{name}.yaml").model)
+    recipe = OmegaConf.load(RECIPES / f"{name}.yaml")
+    bases = [OmegaConf.load(RECIPES / f"{base}.yaml") for base in recipe.get("defaults", []) if base != "_self_"]
+    recipe = OmegaConf.to_container(OmegaConf.merge(*bases, recipe).model)
     assert recipe.pop("preset") == name
     preset = ModelConfig.preset(name)
     assert set(recipe) == {field.name for field in fields(ModelConfig)}
@@ -93,7 +95,7 @@ def test_impossible_sizes_are_refused(wrong, message):
 
 
 def test_an_unknown_preset_is_refused():
-    with pytest.raises(ValueError, match=r"unknown preset 'tiny': choose one of \['cpu', 'paper'\]"):
+    with pytest.raises(ValueError, match=r"unknown preset 'tiny': choose one of \['cpu', 'gpu_short', 'paper'\]"):
         ModelConfig.preset("tiny")
 
 

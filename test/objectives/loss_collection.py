@@ -61,7 +61,7 @@ COLLECTION = {
     "diagnostics": (FICRegLoss, {"diagnostics": True}, "mlp", DETACHED),
     "joint": (JointInverseLoss, {}, "mlp", JOINT),
     "joint_bare": (JointInverseLoss, {"sigreg_coeff": 0.0}, "mlp", {k: JOINT[k] for k in ("loss_pred", "loss_idm")}),
-    "pldm": (PLDMLoss, {"time_cov_coeff": 0.5}, "mlp", PLDM),
+    "pldm": (PLDMLoss, {"time_cov_coeff": 0.5, "idm_coeff": 1.0}, "mlp", PLDM),
 }
 FICREG = [name for name, entry in COLLECTION.items() if entry[0] is FICRegLoss]
 

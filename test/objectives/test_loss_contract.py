@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
+from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
 from torchrl_ficreg import CausalPredictor, ConvEncoder, FICRegLoss, InverseDynamicsModel, LeWMLoss, SIGReg
 
@@ -119,7 +120,7 @@ def test_the_constructors_can_rename_keys(make_clip):
     loss = FICRegLoss(
         ConvEncoder(image_size=16, channels=(4,), in_key=("a", "b"), out_key=("c", "d"), latent_dim=4),
         CausalPredictor(latent_dim=4, action_dim=6, depth=1, width=8, **keys),
-        InverseDynamicsModel(4, 6, 8, in_keys=("past", ("c", "d")), out_key=("i", "j")),
+        InverseDynamicsModel(4, 6, 8, in_keys=(("c", "d"), "after"), out_key=("i", "j")),
         sigreg=SIGReg(4),
     )
     assert len(values(loss, make_clip()).keys()) == 4
@@ -223,7 +224,7 @@ def test_an_error_inside_leaves_the_networks_usable(networks, make_clip, failing
         (lambda c: c.set("pixels", c["pixels"].long()), TypeError, "uint8 .* or floating .* got torch.int64"),
         (lambda c: c.set("pixels", c["pixels"][..., :8]), ValueError, r"pixels must be \[..., 3, 16, 16\]"),
         (lambda c: torch.cat([c, c], 1), ValueError, "sees 1 to 2 latents, got 5"),
-        (lambda c: c.set("mask", torch.ones(8, 3, 1) > 0), ValueError, r"expected \[8, 3\] bool, got \[8, 3, 1\]"),
+        (lambda c: c.set("mask", torch.ones(8, 3, 2) > 0), ValueError, r"expected \[8, 3\] bool, got \[8, 3, 2\]"),
         (lambda c: TensorDict({**c, "mask": torch.ones(8, 1, dtype=torch.bool)}, [8]), ValueError, r"got \[8, 1\]"),
         (lambda c: c.set("mask", torch.ones(8, 3)), ValueError, "got .* torch.float32"),
         (lambda c: c.set("mask", torch.zeros(8, 3) > 0), ValueError, "the mask leaves no transition"),
@@ -279,7 +280,6 @@ def test_networks_of_the_wrong_width_are_refused_and_never_broadcast(networks, m
         ({"encoder": _Narrow(("pixels", "action"), ("latent",))}, "the encoder must read 1 entries, it reads"),
         ({"predictor": _Narrow(("latent",), ("predicted_latent",))}, "the predictor must read 2 entries, it reads"),
         ({"inverse_model": _Narrow(("latent",), ("a",))}, "the inverse_model must read 2 entries, it reads"),
-        ({"encoder": _Narrow(("pixels",), ("code", "skip"))}, "the encoder writes .* and none is 'latent': rename"),
     ],
 )
 def test_networks_whose_keys_do_not_fit_are_refused(networks, change, message):
@@ -291,16 +291,167 @@ def test_a_key_that_no_network_writes_is_named_at_the_first_call(networks, make_
     encoder, predictor, _ = networks()
     loss = FICRegLoss(encoder, predictor, InverseDynamicsModel(6, 6, 8, kind="gaussian"), sigreg=SIGReg(4))
     loss.set_keys(recovered_action="guess")
+    with pytest.raises(KeyError, match="no 'latent' among .*'code', 'skip'.*: see loss.set_keys"):
+        LeWMLoss(_Narrow(("pixels",), ("code", "skip"), keep=3), predictor)(make_clip())
     with pytest.raises(KeyError, match="no 'guess' among .*'recovered_action'.*: see loss.set_keys"):
         loss(make_clip())
 
 
-def test_a_mask_of_another_shape_is_not_broadcast_into_an_empty_loss(make_ficreg, make_clip):
-    """With two frames, [B, 2, 1] cut by one would broadcast every term away."""
+@pytest.mark.parametrize("frames", [2, 3])
+def test_a_mask_shaped_like_torchrls_flags_is_the_same_mask(loss, make_clip, frames):
+    """[B, T, 1] as [B, T], given in the clip, by keyword or by position."""
+    clip, mask = make_clip(frames=frames), torch.rand(8, frames) > 0.3
+    pixels, action = clip["pixels"], clip["action"]
+    expected = values(loss.eval(), clip.clone().set("mask", mask))
+    torch.testing.assert_close(values(loss, clip.set("mask", mask.unsqueeze(-1))), expected, rtol=0, atol=0)
+    by_keyword = values(loss, pixels=pixels, action=action, mask=mask)
+    by_position = values(loss, pixels, action, mask.unsqueeze(-1))
+    for key, *found in zip(loss.out_keys, by_keyword, by_position, strict=True):
+        assert all(value.equal(expected[key]) for value in found), key
+
+
+def test_flat_slices_are_read_as_clips(make_loss, make_clip):
+    """[B * T] with ``num_frames`` is [B, T], masked or not; a number of steps that is no multiple of T is refused."""
+    clip = make_clip().set("mask", torch.rand(8, 3, 1) > 0.3)
+    for name in ("lewm", "paper", "joint", "pldm"):
+        loss = make_loss(name, num_frames=3).eval()
+        expected = values(make_loss(name).eval(), clip)
+        torch.testing.assert_close(values(loss, clip.reshape(24)), expected, rtol=0, atol=0)
+        torch.testing.assert_close(values(loss, clip), expected, rtol=0, atol=0)
+        torch.testing.assert_close(loss.peek(clip.reshape(24)), loss.peek(clip), rtol=0, atol=0)
+        with pytest.raises(ValueError, match="holds 23 steps, which are no whole slices of num_frames=3"):
+            loss(clip.reshape(24)[:23])
+        with pytest.raises(ValueError, match="num_frames=3, the clips have 2 frames"):
+            loss(clip[:, :2])
+    with pytest.raises(ValueError, match="build the loss with num_frames=T"):
+        make_loss("lewm")(clip.reshape(24))
+    with pytest.raises(ValueError, match="num_frames must be a whole number of at least 2 frames, got 1"):
+        make_loss("lewm", num_frames=1)
+
+
+def test_a_slice_sampler_feeds_a_loss(make_loss, make_clip):
+    """Samples of a TensorDictReplayBuffer with a SliceSampler, whole, as TorchRL hands them out."""
+    episodes = make_clip(4, frames=9)
+    episodes["episode"] = torch.arange(4)[:, None].expand(4, 9)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(36), sampler=SliceSampler(slice_len=3, traj_key="episode"), batch_size=24
+    )
+    buffer.extend(episodes.reshape(-1))
+    loss = make_loss("paper", num_frames=3)
+    sum(loss(buffer.sample()).values()).backward()
+    assert all(param.grad is not None for param in loss.parameters())
+
+
+def test_transitions_are_clips_of_two_frames(loss, make_clip):
+    """[B] and [B, 1] with ("next", "pixels"), masked too; a whole clip is read as before, whatever lies beside it."""
     clip = make_clip(frames=2)
-    clip["mask"] = torch.ones(8, 2, 1, dtype=torch.bool)
-    with pytest.raises(ValueError, match="mask"):
-        make_ficreg()(clip)
+    mask = torch.rand(8, 1) > 0.3
+    expected = values(loss.eval(), clip.clone().set("mask", torch.cat([mask, mask], -1)))
+    steps = clip[:, 0].clone()
+    steps["next", "pixels"], steps["mask"] = clip["pixels"][:, 1], mask
+    torch.testing.assert_close(values(loss, steps), expected, rtol=0, atol=0)
+    steps = TensorDict(steps, [8])
+    torch.testing.assert_close(values(loss, steps.unsqueeze(-1)), expected, rtol=0, atol=0)
+    by_keyword = values(
+        loss, pixels=steps["pixels"], action=steps["action"], mask=mask, next_pixels=steps["next", "pixels"]
+    )
+    for key, value in zip(loss.out_keys, by_keyword, strict=True):
+        assert value.equal(expected[key])
+    steps["next", "pixels"] = steps["next", "pixels"][..., :8]
+    with pytest.raises(ValueError, match="must have the shape of 'pixels'"):
+        loss(steps)
+    whole = make_clip()
+    expected = values(loss, whole)
+    whole["next", "pixels"] = torch.zeros_like(whole["pixels"])
+    torch.testing.assert_close(values(loss, whole), expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("batch", [{}, {"mask": torch.ones(8, 3, dtype=torch.bool)}])
+def test_a_plain_dict_is_told_to_become_a_tensordict(loss, make_clip, batch):
+    with pytest.raises(TypeError, match=r"a loss takes a TensorDict, no plain dict or list: wrap it as TensorDict\(batch"):
+        loss({**make_clip(), **batch})
+
+
+def test_a_batch_of_one_transition_is_refused_in_terms_of_clips(make_loss, make_clip):
+    for name in ("lewm", "paper", "joint"):
+        with pytest.raises(ValueError, match="needs at least 2 clips, got 1: use a larger batch"):
+            make_loss(name)(make_clip(1, frames=2))
+    for name in ("joint_bare", "pldm"):
+        with pytest.raises(ValueError, match="BatchNorm in train mode needs at least 2 clips"):
+            make_loss(name)(make_clip(1, frames=2))
+    assert len(make_loss("joint_bare").eval()(make_clip(1, frames=2)).keys()) == 2
+
+
+def test_diagnostics_stand_beside_the_objective(make_loss, make_clip):
+    """Its terms, all that begin with loss_, add up to one number with a gradient, with reports or without."""
+    outputs = [values(make_loss("paper", diagnostics=on), make_clip()) for on in (False, True)]
+    plain, reported = (sum(v for k, v in out.items() if k.startswith("loss_")) for out in outputs)
+    assert reported.equal(plain)
+    reported.backward()
+    assert not any(v.requires_grad for k, v in outputs[1].items() if not k.startswith("loss_"))
+
+
+def test_a_module_with_several_outputs_is_judged_after_set_keys(networks, make_clip, make_ficreg):
+    """Constructors ask for nothing that set_keys can still say."""
+    reference, clip = make_ficreg(0.0), make_clip()
+    encoder, predictor, inverse_model = networks(0.0)
+
+    def twice(module, in_keys, out_keys):
+        return TensorDictSequential(module, TensorDictModule(lambda x: -x, in_keys, out_keys))
+
+    loss = FICRegLoss(
+        twice(encoder, ["latent"], ["skip"]),
+        twice(CausalPredictor.select_out_keys(predictor, "predicted_latent"), ["predicted_latent"], [("x", "hat")]),
+        twice(inverse_model, ["recovered_action"], ["flipped"]),
+        sigreg=SIGReg(16),
+    )
+    torch.testing.assert_close(values(loss, clip), values(reference, clip))
+    other = FICRegLoss(loss.encoder, loss.predictor, loss.inverse_model, sigreg=SIGReg(16))
+    other.set_keys(latent="latent", predicted_latent=("x", "hat"), recovered_action="flipped")
+    assert not values(other, clip)["loss_pred"].equal(values(reference, clip)["loss_pred"])
+
+
+def test_a_loss_can_be_called_with_other_parameters(loss, make_clip):
+    """By TensorDict.to_module, as the refusal of torch.func.functional_call says, which would leave them where they are."""
+    clip, loss = make_clip(), loss.eval()
+    params = {name: param.detach() * 1.1 for name, param in loss.named_parameters()}
+    before = values(loss, clip)
+    with pytest.raises(TypeError, match="write `with TensorDict.*to_module"):
+        torch.func.functional_call(loss, params, (clip,))
+    with TensorDict(params).unflatten_keys(".").to_module(loss):
+        found = values(loss, clip)
+    torch.testing.assert_close(values(loss, clip), before, rtol=0, atol=0)
+    changed = copy.deepcopy(loss)
+    with torch.no_grad():
+        for name, param in changed.named_parameters():
+            param.copy_(params[name])
+    torch.testing.assert_close(found, values(changed, clip))
+
+
+def test_a_loss_can_be_mapped_over_clips(loss, make_clip):
+    """torch.vmap over a leading dimension of data, in eval mode, is the loop over it."""
+    clips, loss = make_clip(2, 8), loss.eval()
+    mapped = torch.vmap(lambda pixels, action: loss(pixels, action))(clips["pixels"], clips["action"])
+    for key, *found in zip(loss.out_keys, mapped, strict=True):
+        torch.testing.assert_close(found[0], torch.stack([values(loss, clip)[key] for clip in clips]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_networks_of_another_dtype_take_the_clips_as_they_are(loss, make_clip, dtype):
+    """As under torch.set_default_dtype: data stay float32, the terms are at least that."""
+    output = loss.to(dtype)(make_clip())
+    assert all(value.dtype == (dtype if dtype == torch.float64 else torch.float32) for value in output.values())
+    sum(output.values()).backward()
+
+
+@pytest.mark.parametrize("name", ["lewm", "paper", "joint", "pldm"])
+def test_a_loss_runs_on_a_device_without_numbers(make_loss, make_clip, name):
+    """On meta tensors, which know neither values nor autocast: terms of the right shape, with a gradient."""
+    with torch.device("meta"):
+        loss = make_loss(name)
+    output = loss(make_clip().to("meta"))
+    assert all(value.shape == () and value.device.type == "meta" for value in output.values())
+    sum(output.values()).backward()
 
 
 def test_unknown_choices_are_refused(networks):

@@ -32,7 +32,7 @@ def make_pldm(run_dir: Path, rank: int, world: int, strategy: str = "ddp") -> Of
     torch.manual_seed(0)
     model, inverse_model = make_world_model(STILL, action_dim=2)
     settings = {"epochs": 1, "lr": 1e-2, "log_interval": 1, "precision": "fp32", "progress_bar": False}
-    loss, data = PLDMLoss(model.encoder, model.predictor, inverse_model, cov_coeff=1.0), make_data(part=(rank, world))
+    loss, data = PLDMLoss(model.encoder, model.predictor, inverse_model, idm_coeff=1.0), make_data(part=(rank, world))
     trainer = OfflineTrainer(loss, data, run_dir=run_dir, strategy=strategy, **settings)
     LatentAlarm(3, "fp32", trainer.metrics_table).register(trainer)
     return trainer

@@ -9,9 +9,10 @@ import pytest
 import torch
 from tiny import make_data, make_trainer, SIZES
 
-from torchrl_ficreg import make_world_model, ViTEncoder
+from torchrl_ficreg import LeWMLoss, make_world_model, ViTEncoder
 from torchrl_ficreg.modules import recompute
 from torchrl_ficreg.modules.recompute import checkpoint_activations
+from torchrl_ficreg.trainers import OfflineTrainer
 
 
 def weights_after(steps: int = 9, **settings) -> list[torch.Tensor]:
@@ -87,6 +88,15 @@ def test_parts_of_a_batch_give_the_mean_of_their_gradients():
         torch.testing.assert_close(found[name], (outputs[0][name] + outputs[1][name]).detach() / 2)
     ours = [p for p in trainer.loss_module.parameters() if p.requires_grad]
     torch.testing.assert_close(ours, params, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("reduction", ["sum", "none"])
+def test_a_loss_that_is_no_mean_is_refused(reduction):
+    """A sum would shrink with every part of a batch and every process."""
+    model, _ = make_world_model(SIZES, 2)
+    loss = LeWMLoss(model.encoder, model.predictor, reduction=reduction)
+    with pytest.raises(ValueError, match=f"needs reduction='mean', got '{reduction}': build the loss with 'mean'"):
+        OfflineTrainer(loss, make_data(), epochs=1, lr=1e-3)
 
 
 @pytest.mark.parametrize("accumulate", [0, 3, 16])

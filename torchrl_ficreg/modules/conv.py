@@ -8,7 +8,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 
 from torchrl_ficreg.data.schema import LATENT, PIXELS
-from torchrl_ficreg.modules.pixels import PixelNormalizer, restore_lead
+from torchrl_ficreg.modules.pixels import channels_last, PixelNormalizer, restore_lead
 from torchrl_ficreg.modules.precision import convolution_region
 from torchrl_ficreg.modules.projector import Projector
 
@@ -45,7 +45,7 @@ class ConvNetwork(nn.Module):
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         """[..., 3, H, W] -> [..., D]."""
-        frames = self.normalize(pixels).contiguous(memory_format=torch.channels_last)  # [N, 3, H, W]
+        frames = channels_last(self.normalize(pixels))  # [N, 3, H, W]
         with convolution_region(frames.device):
             maps = self.convolutions(frames)  # [N, C, H', W']
         return restore_lead(self.projector(maps.flatten(1)), pixels)

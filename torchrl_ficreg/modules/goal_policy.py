@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
+from torchrl_ficreg.modules.feed import sort_keys
 from torchrl_ficreg.modules.goal_network import GoalNetwork
 from torchrl_ficreg.modules.safe_files import read_config, require_safetensors
 from torchrl_ficreg.modules.world_model import LatentWorldModel
@@ -31,7 +32,8 @@ class GoalPolicy(TensorDictModule):
 
     Args:
         latent_dim, action_dim, hidden_dim, depth: see :class:`~torchrl_ficreg.modules.goal_network.GoalNetwork`.
-        in_keys, out_key: where the latent and the goal latent are read, and the action block is written.
+        in_keys, out_key: where the latent and the goal latent are read, told apart by name where they can be, and the action
+            block is written.
 
     Raises:
         ValueError: a size that is not positive.
@@ -54,7 +56,8 @@ class GoalPolicy(TensorDictModule):
         out_key: NestedKey = ACTION,
     ) -> None:
         network = GoalNetwork(latent_dim, action_dim, hidden_dim, depth)
-        super().__init__(network, in_keys=list(in_keys), out_keys=[out_key])
+        keys = sort_keys("policy", in_keys, LATENT, GOAL_LATENT)
+        super().__init__(network, in_keys=keys, out_keys=[out_key])
 
     @property
     def sizes(self) -> dict[str, int]:

@@ -15,6 +15,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 
 from torchrl_ficreg.data.schema import LATENT, RECOVERED_ACTION
+from torchrl_ficreg.modules.feed import NEXT_LATENT, sort_keys
 from torchrl_ficreg.modules.transformer import Block
 
 LOG_VAR, SPREAD = "recovered_action_log_var", "recovered_action_spread"
@@ -156,7 +157,8 @@ class InverseDynamicsModel(TensorDictModule):
         kind: ``"mlp"``, the paper's; ``"gaussian"``, which also writes ``recovered_action_log_var``; ``"ensemble"``,
             which also writes ``recovered_action_spread``; or ``"transformer"``, which sees up to ``history`` latents
             and needs sequences [..., T, D].
-        in_keys, out_key: where the two latents are read and the action block is written.
+        in_keys, out_key: where the two latents are read, told apart by name where they can be, and the action block is
+            written.
         **network: further arguments of the network of that kind (``members``; ``history``, ``depth``, ``heads``).
 
     Raises:
@@ -187,7 +189,8 @@ class InverseDynamicsModel(TensorDictModule):
             raise ValueError(f"unknown kind of inverse model {kind!r}: choose one of {sorted(INVERSE_NETWORKS)}.")
         make, extra_keys = INVERSE_NETWORKS[kind]
         module = make(latent_dim, action_dim, hidden_dim, dropout, **network)
-        super().__init__(module, in_keys=list(in_keys), out_keys=[out_key, *extra_keys])
+        keys = sort_keys("inverse_model", in_keys, LATENT, NEXT_LATENT)
+        super().__init__(module, in_keys=keys, out_keys=[out_key, *extra_keys])
 
 
 INVERSE_NETWORKS = {

@@ -9,8 +9,8 @@ from torch import nn
 
 from torchrl_ficreg.data.schema import LATENT, PIXELS
 from torchrl_ficreg.modules.batch_norm import GlobalBatchNorm1d
-from torchrl_ficreg.modules.pixels import PixelNormalizer, restore_lead
-from torchrl_ficreg.modules.precision import convolution_region
+from torchrl_ficreg.modules.pixels import channels_last, PixelNormalizer, restore_lead
+from torchrl_ficreg.modules.precision import convolution_region, without_autocast
 
 _STRIDE = 4  # pixels between neighbouring places of a map
 
@@ -84,11 +84,11 @@ class KeypointNetwork(nn.Module):
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         """[..., 3, H, W] -> [..., D]."""
-        frames = self.normalize(pixels).contiguous(memory_format=torch.channels_last)  # [N, 3, H, W]
+        frames = channels_last(self.normalize(pixels))  # [N, 3, H, W]
         with convolution_region(frames.device):
             maps = self.convolutions(frames)  # [N, K, H / 4, W / 4]
         # Places are known to a fraction of a pixel, which bfloat16 would round away.
-        with torch.autocast(pixels.device.type, enabled=False):
+        with without_autocast(pixels.device):
             places = self.norm(spatial_softmax(maps).to(self.layer_out.weight.dtype))  # [N, 2 K]
             return restore_lead(self.layer_out(places), pixels)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import nn
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -43,6 +44,13 @@ class PixelNormalizer(nn.Module):
         if pixels.is_floating_point():
             return frames.to(self.scale.dtype) * self.scale + self.shift
         raise TypeError(f"pixels must be uint8 (0..255) or floating (0..1), got {pixels.dtype}: convert them.")
+
+
+def channels_last(frames: torch.Tensor) -> torch.Tensor:
+    """Frames [N, 3, H, W] in the layout that convolutions on CPUs want; under ``vmap``, which knows none, as they are."""
+    if not torch.compiler.is_compiling() and is_functorch_wrapped_tensor(frames):
+        return frames
+    return frames.contiguous(memory_format=torch.channels_last)
 
 
 def restore_lead(latent: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:

@@ -113,12 +113,12 @@ def autocast(device: torch.device | str, precision: Precision = "auto") -> torch
     return torch.autocast(torch.device(device).type, dtype=torch.bfloat16, enabled=uses_bf16(device, precision))
 
 
-def convolution_region(device: torch.device) -> torch.autocast:
-    """Within a region of :func:`autocast`: bfloat16 stays on only where convolutions in it are fast."""
-    on = torch.is_autocast_enabled(device.type)
-    dtype = torch.get_autocast_dtype(device.type)
-    fast = on and (dtype != torch.bfloat16 or device.type != "cpu" or has_fast_bf16(device, "convolutions"))
-    return torch.autocast(device.type, dtype=dtype, enabled=fast)
+def convolution_region(device: torch.device) -> contextlib.AbstractContextManager:
+    """Within a region of :func:`autocast`: bfloat16 goes off on a CPU that is slow at convolutions in it."""
+    slow = device.type == "cpu" and in_autocast(device) and torch.get_autocast_dtype("cpu") == torch.bfloat16
+    if slow and not has_fast_bf16(device, "convolutions"):
+        return without_autocast(device)
+    return contextlib.nullcontext()
 
 
 def describe_precision(device: torch.device | str, precision: Precision = "auto") -> str:
@@ -141,3 +141,15 @@ def describe_processor() -> str:
     figures = (f"{bf16_speedup(kind):.1f} x in {kind}" for kind in get_args(Kind))
     capability = torch.backends.cpu.get_cpu_capability()
     return f"{name}, {capability}, bf16 is {', '.join(figures)}"
+
+
+def without_autocast(device: torch.device) -> contextlib.AbstractContextManager:
+    """A region in which autocast is off, on devices that know none (meta) too."""
+    if not torch.amp.is_autocast_available(device.type):
+        return contextlib.nullcontext()
+    return torch.autocast(device.type, enabled=False)
+
+
+def in_autocast(device: torch.device) -> bool:
+    """Whether autocast is on for a device."""
+    return torch.amp.is_autocast_available(device.type) and torch.is_autocast_enabled(device.type)

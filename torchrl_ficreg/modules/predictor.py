@@ -8,6 +8,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 
 from torchrl_ficreg.data.schema import ACTION, LATENT, PREDICTED_LATENT
+from torchrl_ficreg.modules.feed import sort_keys
 from torchrl_ficreg.modules.projector import Projector
 from torchrl_ficreg.modules.recompute import run_block
 from torchrl_ficreg.modules.transformer import AdaptiveBlock, Cache
@@ -206,7 +207,8 @@ class CausalPredictor(TensorDictModule):
     ``position_std=1.0``, which ``ModelConfig.preset("paper")`` sets.
 
     Args:
-        in_keys, out_key: where latents and action blocks are read, and predictions written.
+        in_keys, out_key: where latents and action blocks are read, told apart by name where they can be, and predictions
+            written.
         **network: see :class:`CausalTransformer`.
 
     Raises:
@@ -226,7 +228,8 @@ class CausalPredictor(TensorDictModule):
         out_key: NestedKey = PREDICTED_LATENT,
         **network,
     ) -> None:
-        super().__init__(CausalTransformer(**network), in_keys=list(in_keys), out_keys=[out_key])
+        keys = sort_keys("predictor", in_keys, LATENT, ACTION)
+        super().__init__(CausalTransformer(**network), in_keys=keys, out_keys=[out_key])
 
     @property
     def history(self) -> int:

@@ -71,8 +71,8 @@ class ModelConfig:
 
         Args:
             name: ``"paper"``, ViT-Tiny/14 at 224 pixels (18.0 M parameters in the world model, arXiv 2603.19312) with
-                the initialisation of the published code, or
-                ``"cpu"``, a convolutional encoder at 64 pixels that trains in minutes on two cores.
+                the initialisation of the published code; ``"gpu_short"``, the same at 112 pixels; or ``"cpu"``, a
+                convolutional encoder at 64 pixels that trains in minutes on two cores.
             **changes: fields to set otherwise.
         """
         if name not in PRESETS:
@@ -80,8 +80,10 @@ class ModelConfig:
         return replace(PRESETS[name], **changes)
 
 
+_PAPER = ModelConfig(encoder_init="published", predictor_attention_dropout=0.1, predictor_position_std=1.0)
 PRESETS = {
-    "paper": ModelConfig(encoder_init="published", predictor_attention_dropout=0.1, predictor_position_std=1.0),
+    "paper": _PAPER,
+    "gpu_short": replace(_PAPER, image_size=112),
     "cpu": ModelConfig(
         encoder="conv",
         image_size=64,

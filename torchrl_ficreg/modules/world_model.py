@@ -8,6 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_ficreg.data.schema import ACTION, LATENT, PIXELS, PREDICTED_LATENT
 from torchrl_ficreg.data.statistics import ActionStatistics
+from torchrl_ficreg.modules.feed import arrange, choose_output, feed, Names, read_output
 from torchrl_ficreg.modules.predictor import CausalPredictor
 
 
@@ -19,7 +20,8 @@ class LatentWorldModel(TensorDictModuleBase):
 
     Args:
         encoder: reads ``pixels`` [..., 3, H, W], writes ``latent`` [..., D].
-        predictor: reads ``latent`` and ``action``, writes ``predicted_latent``.
+        predictor: reads ``latent`` and ``action``, writes ``predicted_latent``; fed by name as in
+            :class:`~torchrl_ficreg.LeWMLoss`.
         frame_skip: F, raw actions in one block.
         statistics: mean and std [A] of raw actions; zeros and ones when none are given.
 
@@ -42,6 +44,7 @@ class LatentWorldModel(TensorDictModuleBase):
         statistics: ActionStatistics | None = None,
     ) -> None:
         super().__init__()
+        arrange("predictor", predictor.in_keys, self._names(encoder))
         block = predictor.module.action_dim
         if block % frame_skip:
             raise ValueError(f"an action block of width {block} is no multiple of frame_skip {frame_skip}.")
@@ -84,11 +87,19 @@ class LatentWorldModel(TensorDictModuleBase):
 
     def encode(self, pixels: torch.Tensor) -> torch.Tensor:
         """Frames [..., 3, H, W], uint8 or floats in 0..1 -> latents [..., D]."""
-        return _by_keys(self.encoder, pixels)
+        written = self.encoder(feed("encoder", self.encoder, {PIXELS: pixels}))
+        return read_output(self.encoder, written, LATENT, -1)
 
     def predict(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Latents [..., T, D] and the z-scored action blocks leading on [..., T, F * A] -> next latents [..., T, D]."""
-        return _by_keys(self.predictor, latent, action)
+        inputs = {LATENT: latent, ACTION: action}
+        written = self.predictor(feed("predictor", self.predictor, inputs, self._names(self.encoder)))
+        return read_output(self.predictor, written, PREDICTED_LATENT, -1)
+
+    @staticmethod
+    def _names(encoder: TensorDictModuleBase) -> Names:
+        """What the predictor may call its inputs beside their contract names."""
+        return {LATENT: (choose_output(encoder, LATENT) or LATENT,), ACTION: ()}
 
     def rollout(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Imagines where a sequence of action blocks leads, feeding predictions back.
@@ -143,9 +154,3 @@ class LatentWorldModel(TensorDictModuleBase):
         latent = self.encode(tensordict.get(PIXELS))
         predicted = self.predict(latent[..., :-1, :], tensordict.get(ACTION)[..., :-1, :])
         return TensorDict({LATENT: latent, PREDICTED_LATENT: predicted}, latent.shape[:-2])
-
-
-def _by_keys(module: TensorDictModuleBase, *inputs: torch.Tensor) -> torch.Tensor:
-    """Calls a TensorDictModule on tensors, whatever its keys are called; its last output."""
-    tensordict = TensorDict(dict(zip(module.in_keys, inputs)))
-    return module(tensordict).get(module.out_keys[-1])

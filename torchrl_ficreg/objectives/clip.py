@@ -1,15 +1,17 @@
-"""What a loss reads: the tensors of a clip, checked once at the door, and modules fed by their own keys."""
+"""What a loss reads: the tensors of a clip, checked once at the door, and what its networks write."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 from torchrl_ficreg.modules.collectives import sum_over_processes
+from torchrl_ficreg.modules.feed import choose_output
 
 
 class Clip(NamedTuple):
@@ -33,7 +35,13 @@ class Clip(NamedTuple):
         return torch.cat([torch.ones_like(self.mask[..., :1]), self.mask], dim=-1)
 
 
-def read_clip(tensordict: TensorDictBase, pixels: NestedKey, action: NestedKey, mask: NestedKey) -> Clip:
+def read_clip(
+    tensordict: TensorDictBase,
+    pixels: NestedKey,
+    action: NestedKey,
+    mask: NestedKey,
+    num_frames: int | None = None,
+) -> Clip:
     """Reads and checks a clip.
 
     Values are looked at on the CPU and in eager mode only, where it costs next to nothing. On an accelerator it would
@@ -42,40 +50,88 @@ def read_clip(tensordict: TensorDictBase, pixels: NestedKey, action: NestedKey, 
 
     Args:
         tensordict: left as it is.
-        pixels: key of [..., T, 3, H, W], T >= 2.
-        action: key of [..., T, F * A]; the last block is not used.
-        mask: key of [..., T] bool; may be missing.
+        pixels: key of [..., T, 3, H, W], T >= 2; of [B * T, 3, H, W] with ``num_frames``; or of [B, 3, H, W], where
+            ``("next", pixels)`` holds the frames that the transitions lead to.
+        action: key of [..., T, F * A], the last block is not used; [B, F * A] for transitions.
+        mask: key of [..., T] or [..., T, 1] bool; may be missing.
+        num_frames: T of flat slices.
 
     Raises:
         KeyError: a key is missing.
+        TypeError: an entry is no tensor.
         ValueError: shapes that do not fit, no transition left by the mask, or actions that are not finite.
     """
-    frames, blocks = require(tensordict, pixels), require(tensordict, action)
-    if 0 in frames.shape:
-        raise ValueError(f"the batch of clips is empty, pixels are {list(frames.shape)}: sample at least one clip.")
-    if frames.ndim < 5 or frames.shape[-4] < 2:
-        raise ValueError(
-            f"a loss needs clips of at least 2 frames, pixels [B, T, 3, H, W] with T >= 2, "
-            f"got {list(frames.shape)}: sample longer clips (num_frames)."
-        )
-    if blocks.shape[:-1] != frames.shape[:-3]:
-        raise ValueError(
-            f"every frame has an action block: expected action {[*frames.shape[:-3], 'F * A']}, "
-            f"got {list(blocks.shape)}."
-        )
+    frames, blocks = read_frames(tensordict, pixels, num_frames), require(tensordict, action)
     trusted = tensordict.get(mask, None)
-    blocks = blocks[..., :-1, :]
+    lead = frames.shape[:-3]  # [..., T]
+    if is_transitions(tensordict, pixels, num_frames):
+        lead = frames.shape[:-4]  # one action block for two frames
+    elif num_frames is not None and blocks.ndim == 2:
+        blocks = _fold(blocks, num_frames, action)
+        trusted = trusted if trusted is None else _fold(trusted, num_frames, mask)
+    if blocks.shape[:-1] != lead:
+        raise ValueError(f"every frame has an action block: expected action {[*lead, 'F * A']}, got {list(blocks.shape)}.")
     if trusted is not None:
-        if trusted.shape != frames.shape[:-3] or trusted.dtype != torch.bool:
+        if trusted.shape not in (lead, (*lead, 1)) or trusted.dtype != torch.bool:
             raise ValueError(
-                f"a mask says of every action block whether to trust it: expected {list(frames.shape[:-3])} bool, "
-                f"got {list(trusted.shape)} {trusted.dtype}."
+                f"a mask says of every action block whether to trust it: expected {list(lead)} bool, got "
+                f"{list(trusted.shape)} {trusted.dtype}."
             )
-        trusted = trusted[..., :-1]
+        trusted = trusted.reshape(lead)
+    if lead == frames.shape[:-3]:
+        blocks, trusted = blocks[..., :-1, :], trusted if trusted is None else trusted[..., :-1]
+    else:
+        blocks, trusted = blocks.unsqueeze(-2), trusted if trusted is None else trusted.unsqueeze(-1)
+    if trusted is not None:
         blocks = torch.where(trusted.unsqueeze(-1), blocks, 0.0)
-    if blocks.device.type == "cpu" and not torch.compiler.is_compiling():
+    if blocks.device.type == "cpu" and not torch.compiler.is_compiling() and not is_functorch_wrapped_tensor(blocks):
         _check_values(blocks, trusted)
     return Clip(frames, blocks, trusted)
+
+
+def read_frames(tensordict: TensorDictBase, pixels: NestedKey, num_frames: int | None = None) -> torch.Tensor:
+    """The frames [..., T, 3, H, W] of a clip, of flat slices or of transitions; see :func:`read_clip`."""
+    frames = require(tensordict, pixels)
+    if 0 in frames.shape:
+        raise ValueError(f"the batch of clips is empty, pixels are {list(frames.shape)}: sample at least one clip.")
+    if is_transitions(tensordict, pixels, num_frames):
+        following = require(tensordict, _next(pixels))
+        if following.shape != frames.shape:
+            raise ValueError(
+                f"{_next(pixels)} must have the shape of {pixels!r}, got {list(following.shape)} for {list(frames.shape)}."
+            )
+        return torch.stack([frames, following], dim=-4)
+    if num_frames is not None and frames.ndim == 4:
+        frames = _fold(frames, num_frames, pixels)
+    if frames.ndim < 5 or frames.shape[-4] < 2:
+        raise ValueError(
+            f"a loss needs clips of at least 2 frames, pixels [B, T, 3, H, W] with T >= 2, got {list(frames.shape)}: "
+            "build the loss with num_frames=T for the flat slices of a SliceSampler, else sample longer clips."
+        )
+    if num_frames is not None and frames.shape[-4] != num_frames:
+        raise ValueError(f"the loss has num_frames={num_frames}, the clips have {frames.shape[-4]} frames.")
+    return frames
+
+
+def is_transitions(tensordict: TensorDictBase, pixels: NestedKey, num_frames: int | None) -> bool:
+    """Whether the batch holds single steps and the frames they lead to, TorchRL's layout, instead of clips."""
+    frames = require(tensordict, pixels)
+    single = num_frames is None and (frames.ndim == 4 or frames.ndim > 4 and frames.shape[-4] == 1)
+    return single and tensordict.get(_next(pixels), None) is not None
+
+
+def _next(key: NestedKey) -> NestedKey:
+    return unravel_key(("next", key))
+
+
+def _fold(value: torch.Tensor, num_frames: int, key: NestedKey) -> torch.Tensor:
+    """[B * T, ...] -> [B, T, ...]."""
+    if len(value) % num_frames:
+        raise ValueError(
+            f"{key!r} holds {len(value)} steps, which are no whole slices of num_frames={num_frames}: sample slices of that "
+            "length (SliceSampler, strict_length=True)."
+        )
+    return value.unflatten(0, (-1, num_frames))
 
 
 def _check_values(blocks: torch.Tensor, mask: torch.Tensor | None) -> None:
@@ -99,42 +155,25 @@ def require(tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
     if value is None:
         present = ", ".join(str(name) for name in tensordict.keys(True, True))
         raise KeyError(f"the clip has no {key!r}, only {present}: rename it, or name it with loss.set_keys(...).")
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(
+            f"{key!r} of the clip is no tensor but a {type(value).__name__}: a loss takes a TensorDict, no plain dict or "
+            "list: wrap it as TensorDict(batch, batch_size=[B])."
+        )
     return value
 
 
-def check_module(name: str, module: TensorDictModule, num_inputs: int, out_key: NestedKey) -> None:
-    """Whether a loss can feed a module.
-
-    Args:
-        name: what the loss calls it.
-        module: any TensorDictModule.
-        num_inputs: tensors it must read, in the order the loss gives them.
-        out_key: the entry the loss takes when the module writes several.
-
-    Raises:
-        ValueError: another number of inputs, or none of its several outputs is called ``out_key``.
-    """
-    if len(module.in_keys) != num_inputs:
-        raise ValueError(f"the {name} must read {num_inputs} entries, it reads {module.in_keys}: wrap it accordingly.")
-    if len(module.out_keys) > 1 and out_key not in module.out_keys:
-        raise ValueError(
-            f"the {name} writes {module.out_keys} and none is {out_key!r}: rename the right one, or select it with "
-            "selected_out_keys of a TensorDictSequential."
-        )
-
-
-def call(module: TensorDictModule, params: TensorDictBase, *inputs: torch.Tensor) -> TensorDictBase:
-    """Feeds a TensorDictModule, with these parameters, by its own keys.
+def call(module: TensorDictModule, params: TensorDictBase, tensordict: TensorDictBase) -> TensorDictBase:
+    """Calls a TensorDictModule with these parameters.
 
     Args:
         module: left as it is, after an error too.
         params: its parameters and buffers for this call.
-        *inputs: one tensor for each of its ``in_keys``.
+        tensordict: what it reads; see :func:`~torchrl_ficreg.modules.feed.feed`.
 
     Returns:
         what it read and wrote.
     """
-    tensordict = TensorDict(dict(zip(module.in_keys, inputs)), batch_size=inputs[0].shape[:1])
     swap = params.to_module(module, preserve_module_state=False)
     swap.__enter__()
     # Not a with statement: after an Exception tensordict leaves the module with these parameters, and for any other, such
@@ -151,8 +190,10 @@ def output(module: TensorDictModule, tensordict: TensorDictBase, key: NestedKey)
     Raises:
         KeyError: it wrote several, and none has that name.
     """
-    key = key if len(module.out_keys) > 1 else module.out_keys[0]
-    value = tensordict.get(key, None)
-    if value is None:
-        raise KeyError(f"no {key!r} among {module.out_keys}, what the network writes: see loss.set_keys(...).")
-    return value
+    chosen = choose_output(module, key)
+    if chosen is None:
+        raise KeyError(
+            f"no {key!r} among {module.out_keys}, what the network writes: see loss.set_keys(...), or select the right one "
+            "with selected_out_keys of a TensorDictSequential."
+        )
+    return tensordict.get(chosen)

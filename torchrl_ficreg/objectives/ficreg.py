@@ -6,10 +6,10 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch, TensorDictModule
+from tensordict.nn import TensorDictModule
 
 from torchrl_ficreg.modules.inverse import LOG_VAR
-from torchrl_ficreg.objectives.base import Reduction, with_own_buffers
+from torchrl_ficreg.objectives.base import Reduction, takes_clip, with_own_buffers
 from torchrl_ficreg.objectives.clip import Clip
 from torchrl_ficreg.objectives.gather import gather_clips
 from torchrl_ficreg.objectives.judge import inverse_error, judge_report, mean_where, Recovered, trust
@@ -52,7 +52,7 @@ class FICRegLoss(LeWMLoss):
         encoder, predictor: see :class:`LeWMLoss`.
         inverse_model: reads two latents [..., D], writes the action block between them [..., F * A] and, where it
             knows, how sure it is; see :class:`~torchrl_ficreg.InverseDynamicsModel`.
-        sigreg, sigreg_coeff, reduction: see :class:`LeWMLoss`.
+        sigreg, sigreg_coeff, reduction, num_frames: see :class:`LeWMLoss`.
         idm_coeff: mu, weight of the inverse model's own loss.
         consistency_coeff: gamma, weight of the judgement on imagined transitions.
         context: ``"detached"`` or ``"live"``, see above.
@@ -63,8 +63,9 @@ class FICRegLoss(LeWMLoss):
             transition: predictions are then not rewarded for carrying more of the action than reality does, as at
             walls and contacts.
         consistency_steps: k; also judges imagined transitions 2 to k steps deep, each fed by predictions.
-        diagnostics: also write, detached, ``judge_r2_real``, ``judge_r2_imagined`` and ``judge_r2_shuffled`` [F * A]
-            (:func:`~torchrl_ficreg.objectives.judge.judge_report`) and ``judge_trust`` [F * A], the mean weight.
+        diagnostics: also write, detached and no part of the objective, ``judge_r2_real``, ``judge_r2_imagined`` and
+            ``judge_r2_shuffled`` [F * A] (:func:`~torchrl_ficreg.objectives.judge.judge_report`) and ``judge_trust``
+            [F * A], the mean weight.
 
     Raises:
         KeyError, ValueError, TypeError: see :class:`LeWMLoss`; ValueError for an unknown choice, for ``"nll"`` without
@@ -78,7 +79,7 @@ class FICRegLoss(LeWMLoss):
         >>> loss = FICRegLoss(model.encoder, model.predictor, inverse_model)
         >>> pixels = torch.randint(0, 256, (8, 2, 3, 64, 64), dtype=torch.uint8)
         >>> output = loss(TensorDict({"pixels": pixels, "action": torch.randn(8, 2, 10)}, [8, 2]))
-        >>> sum(output.values()).backward()
+        >>> sum(value for key, value in output.items() if key.startswith("loss_")).backward()
         >>> sorted(output.keys())
         ['loss_consistency', 'loss_idm', 'loss_pred', 'loss_sigreg']
     """
@@ -99,6 +100,7 @@ class FICRegLoss(LeWMLoss):
         consistency_coeff: float = 0.1,
         context: Literal["detached", "live"] = "detached",
         reduction: Reduction = "mean",
+        num_frames: int | None = None,
         consistency: Literal["mse", "nll", "trusted"] = "mse",
         consistency_target: Literal["action", "judge"] = "action",
         consistency_steps: int = 1,
@@ -110,6 +112,7 @@ class FICRegLoss(LeWMLoss):
             sigreg=sigreg,
             sigreg_coeff=sigreg_coeff,
             reduction=reduction,
+            num_frames=num_frames,
             inverse_model=inverse_model,
         )
         self._register_coefficients(idm_coeff=idm_coeff, consistency_coeff=consistency_coeff)
@@ -127,7 +130,7 @@ class FICRegLoss(LeWMLoss):
         if diagnostics:
             self.out_keys = [*self.out_keys, "judge_r2_real", "judge_r2_imagined", "judge_r2_shuffled", "judge_trust"]
 
-    @dispatch
+    @takes_clip
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
         clip = self._read(tensordict)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch, TensorDictModule
+from tensordict.nn import TensorDictModule
 
-from torchrl_ficreg.objectives.base import Reduction
+from torchrl_ficreg.objectives.base import Reduction, takes_clip
 from torchrl_ficreg.objectives.judge import inverse_error
 from torchrl_ficreg.objectives.lewm import LeWMLoss
 from torchrl_ficreg.objectives.sigreg import SIGReg
@@ -34,7 +34,7 @@ class JointInverseLoss(LeWMLoss):
     not computed and ``loss_sigreg`` not written.
 
     Args:
-        encoder, predictor, sigreg, sigreg_coeff, reduction: see :class:`~torchrl_ficreg.LeWMLoss`.
+        encoder, predictor, sigreg, sigreg_coeff, reduction, num_frames: see :class:`~torchrl_ficreg.LeWMLoss`.
         inverse_model: see :class:`~torchrl_ficreg.FICRegLoss`.
         idm_coeff: mu. SMWM tunes it from 0.1 to 30 by task.
 
@@ -49,7 +49,7 @@ class JointInverseLoss(LeWMLoss):
         >>> loss = JointInverseLoss(model.encoder, model.predictor, inverse_model, sigreg_coeff=0.0)
         >>> pixels = torch.randint(0, 256, (8, 2, 3, 64, 64), dtype=torch.uint8)
         >>> output = loss(TensorDict({"pixels": pixels, "action": torch.randn(8, 2, 10)}, [8, 2]))
-        >>> sum(output.values()).backward()
+        >>> sum(value for key, value in output.items() if key.startswith("loss_")).backward()
         >>> sorted(output.keys())
         ['loss_idm', 'loss_pred']
     """
@@ -68,6 +68,7 @@ class JointInverseLoss(LeWMLoss):
         sigreg_coeff: float = 0.09,
         idm_coeff: float = 1.0,
         reduction: Reduction = "mean",
+        num_frames: int | None = None,
     ) -> None:
         super().__init__(
             encoder,
@@ -75,13 +76,14 @@ class JointInverseLoss(LeWMLoss):
             sigreg=sigreg,
             sigreg_coeff=sigreg_coeff,
             reduction=reduction,
+            num_frames=num_frames,
             inverse_model=inverse_model,
         )
         self._register_coefficients(idm_coeff=idm_coeff)
-        self.regularised = sigreg_coeff > 0
+        self.regularised = self._compares_clips = sigreg_coeff > 0
         self.out_keys = ["loss_pred", "loss_sigreg", "loss_idm"] if self.regularised else ["loss_pred", "loss_idm"]
 
-    @dispatch
+    @takes_clip
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
         clip = self._read(tensordict)

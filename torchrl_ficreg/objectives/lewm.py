@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch, TensorDictModule
+from tensordict.nn import TensorDictModule
 
-from torchrl_ficreg.objectives.base import LatentLoss, Reduction
+from torchrl_ficreg.objectives.base import LatentLoss, Reduction, takes_clip
 from torchrl_ficreg.objectives.clip import Clip
 from torchrl_ficreg.objectives.sigreg import SIGReg
 from torchrl_ficreg.objectives.terms import squared_error
@@ -20,11 +20,24 @@ class LeWMLoss(LatentLoss):
     No stop-gradient: the target trains the encoder too.
 
     Reads a clip [B, T]: ``pixels`` [B, T, 3, H, W], ``action`` [B, T, F * A] (z-scored blocks; block k leads from
-    frame k to k + 1, the last one is not used) and, where there is one, ``mask`` [B, T] bool (false where a block is
-    not to be trusted: its transition, its action and the frame it leads to are left out of every term. BatchNorm
-    layers still see that frame).
+    frame k to k + 1, the last one is not used) and, where there is one, ``mask`` [B, T] or [B, T, 1] bool (false where a
+    block is not to be trusted: its transition, its action and the frame it leads to are left out of every term.
+    BatchNorm layers still see that frame). Two other layouts of TorchRL are read as clips: flat slices [B * T], given
+    ``num_frames``, and transitions [B] with ``("next", "pixels")``, which are clips of two frames. By keyword:
+    ``loss(pixels=, action=, mask=, next_pixels=)``, the last two optional: ``in_keys`` lists what must be there, so name the
+    mask beside them where entries are selected.
 
-    Writes a new tensordict: ``loss_pred`` and ``loss_sigreg``, already weighted, whose plain sum is the objective.
+    Networks are fed by the names of their ``in_keys``, in whatever order: ``latent`` or what the encoder writes,
+    ``action``, and for an inverse model ``next_latent`` or ``("next", "latent")``; the last part of a nested key counts,
+    and so do the names of :meth:`set_keys`. Keys of other names are fed by position, in the order given below.
+
+    Writes a new tensordict: ``loss_pred`` and ``loss_sigreg``, already weighted. The sum of all entries that begin with
+    ``loss_`` is the objective.
+
+    To call it with other parameters, use ``with TensorDict(params).unflatten_keys(".").to_module(loss)``, where ``params``
+    holds all names of ``loss.named_parameters()``; :func:`torch.func.functional_call` is refused, as it does not reach
+    them. :func:`torch.vmap` over data needs ``eval()`` where networks hold BatchNorm or dropout, as for any module;
+    values are not checked there.
 
     Args:
         encoder: reads ``pixels``, writes ``latent`` [..., D].
@@ -32,12 +45,13 @@ class LeWMLoss(LatentLoss):
         sigreg: the regulariser; a default :class:`SIGReg` when None.
         sigreg_coeff: lambda. 0.09 belongs to a batch of 128 clips.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over transitions; the regulariser is one number either way.
+        num_frames: T of flat slices [B * T], as a ``SliceSampler`` samples them; None where clips are [B, T].
 
     Raises:
         KeyError: the clip lacks a key.
-        ValueError: an unknown reduction, a negative coefficient, networks that cannot be fed, a clip of one frame, or
-            widths the networks were not built for.
-        TypeError: pixels that are neither uint8 nor floating.
+        ValueError: an unknown reduction, a negative coefficient, networks that cannot be fed, a clip of one frame,
+            a batch of one clip, or widths the networks were not built for.
+        TypeError: pixels that are neither uint8 nor floating, or a plain dict for a tensordict.
 
     Examples:
         >>> import torch
@@ -47,13 +61,14 @@ class LeWMLoss(LatentLoss):
         >>> loss = LeWMLoss(model.encoder, model.predictor)
         >>> pixels = torch.randint(0, 256, (8, 2, 3, 64, 64), dtype=torch.uint8)
         >>> output = loss(TensorDict({"pixels": pixels, "action": torch.randn(8, 2, 10)}, [8, 2]))
-        >>> sum(output.values()).backward()
+        >>> sum(value for key, value in output.items() if key.startswith("loss_")).backward()
         >>> sorted(output.keys())
         ['loss_pred', 'loss_sigreg']
     """
 
     out_keys = ["loss_pred", "loss_sigreg"]
     _networks = ("encoder", "predictor")
+    _compares_clips = True
     _schedulable_buffers = frozenset({"sigreg_coeff"})
 
     def __init__(
@@ -64,13 +79,14 @@ class LeWMLoss(LatentLoss):
         sigreg: SIGReg | None = None,
         sigreg_coeff: float = 0.09,
         reduction: Reduction = "mean",
+        num_frames: int | None = None,
         **networks: TensorDictModule,
     ) -> None:
-        super().__init__(reduction=reduction, encoder=encoder, predictor=predictor, **networks)
+        super().__init__(reduction=reduction, num_frames=num_frames, encoder=encoder, predictor=predictor, **networks)
         self.sigreg = SIGReg() if sigreg is None else sigreg
         self._register_coefficients(sigreg_coeff=sigreg_coeff)
 
-    @dispatch
+    @takes_clip
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
         clip = self._read(tensordict)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch, TensorDictModule
+from tensordict.nn import TensorDictModule
 
-from torchrl_ficreg.objectives.base import LatentLoss, Reduction
+from torchrl_ficreg.objectives.base import LatentLoss, Reduction, takes_clip
 from torchrl_ficreg.objectives.gather import gather_clips
 from torchrl_ficreg.objectives.judge import inverse_error
 from torchrl_ficreg.objectives.terms import hinge_std, off_diagonal_covariance, squared_error
@@ -23,11 +23,12 @@ class PLDMLoss(LatentLoss):
 
     ``loss_pred`` is that of LeWorldModel. ``loss_var`` and ``loss_cov`` are VICReg's hinge on the standard deviation
     and penalty on covariances (arXiv 2105.04906) over the batch, at every time step; ``loss_time_var`` and
-    ``loss_time_cov`` the same over the time steps of every clip; ``loss_time_sim`` the squared difference of successive
-    latents; ``loss_idm`` the error of an inverse model trained with the encoder. Names and Greek letters are those of
-    appendix C.2 of the LeWorldModel paper (arXiv 2603.19312); covariances are squared, as in VICReg, and their sum is divided by
-    D. The published code of PLDM divides by D (D - 1), centres the latents over the batch before the terms over time, and has
-    other weights: a published weight of the covariance belongs to a term D - 1 times as small.
+    ``loss_time_cov`` the same over the time steps of every clip, from which the mean over the batch is subtracted at every
+    time step and no mean over time; ``loss_time_sim`` the squared difference of successive latents; ``loss_idm`` the error
+    of an inverse model trained with the encoder. Names and Greek letters are those of appendix C.2 of the LeWorldModel
+    paper (arXiv 2603.19312). Normalisation and default weights are those of the published code (stable-worldmodel, the
+    baseline of that paper): covariances are squared, as in VICReg, and averaged over the D² - D entries off the diagonal;
+    the weights belong to D = 192.
 
     ====================  =======  =========  =============
     term                  encoder  predictor  inverse model
@@ -50,15 +51,16 @@ class PLDMLoss(LatentLoss):
 
     Args:
         encoder, predictor: see :class:`~torchrl_ficreg.LeWMLoss`.
-        inverse_model: see :class:`~torchrl_ficreg.FICRegLoss`.
+        inverse_model: see :class:`~torchrl_ficreg.FICRegLoss`; used where ``idm_coeff`` is positive.
         var_coeff: alpha, of the variance over the batch.
         cov_coeff: beta, of the covariance over the batch.
         time_sim_coeff: gamma, of temporal similarity.
         time_var_coeff: zeta, of the variance over time; needs clips of 2 frames or more.
         time_cov_coeff: nu, of the covariance over time.
-        idm_coeff: mu, of the inverse model.
+        idm_coeff: mu, of the inverse model; the published weight is 0.
         std_margin: standard deviation asked for.
         reduction: over transitions; the statistics are one number either way.
+        num_frames: see :class:`~torchrl_ficreg.LeWMLoss`.
 
     Raises:
         KeyError, ValueError, TypeError: see :class:`~torchrl_ficreg.LeWMLoss`.
@@ -71,9 +73,9 @@ class PLDMLoss(LatentLoss):
         >>> loss = PLDMLoss(model.encoder, model.predictor, inverse_model)
         >>> pixels = torch.randint(0, 256, (8, 2, 3, 64, 64), dtype=torch.uint8)
         >>> output = loss(TensorDict({"pixels": pixels, "action": torch.randn(8, 2, 10)}, [8, 2]))
-        >>> sum(output.values()).backward()
+        >>> sum(value for key, value in output.items() if key.startswith("loss_")).backward()
         >>> sorted(output.keys())
-        ['loss_cov', 'loss_idm', 'loss_pred', 'loss_time_sim', 'loss_time_var', 'loss_var']
+        ['loss_cov', 'loss_pred', 'loss_time_sim', 'loss_time_var', 'loss_var']
     """
 
     out_keys = list(_TERMS)
@@ -88,16 +90,23 @@ class PLDMLoss(LatentLoss):
         predictor: TensorDictModule,
         inverse_model: TensorDictModule,
         *,
-        var_coeff: float = 1.0,
-        cov_coeff: float = 1.0,
-        time_sim_coeff: float = 1.0,
-        time_var_coeff: float = 1.0,
+        var_coeff: float = 18.0,
+        cov_coeff: float = 12.0,
+        time_sim_coeff: float = 0.2,
+        time_var_coeff: float = 0.7,
         time_cov_coeff: float = 0.0,
-        idm_coeff: float = 1.0,
+        idm_coeff: float = 0.0,
         std_margin: float = 1.0,
         reduction: Reduction = "mean",
+        num_frames: int | None = None,
     ) -> None:
-        super().__init__(reduction=reduction, encoder=encoder, predictor=predictor, inverse_model=inverse_model)
+        super().__init__(
+            reduction=reduction,
+            num_frames=num_frames,
+            encoder=encoder,
+            predictor=predictor,
+            inverse_model=inverse_model,
+        )
         coefficients = {
             "var_coeff": var_coeff,
             "cov_coeff": cov_coeff,
@@ -113,7 +122,7 @@ class PLDMLoss(LatentLoss):
         used = {f"loss_{name.removesuffix('_coeff')}" for name, value in coefficients.items() if value > 0}
         self.out_keys = [key for key in _TERMS if key == "loss_pred" or key in used]
 
-    @dispatch
+    @takes_clip
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
         clip = self._read(tensordict)
@@ -123,12 +132,14 @@ class PLDMLoss(LatentLoss):
         over_batch = gather_clips(latent.flatten(0, -3).transpose(0, 1), dim=1)  # [T, B of all processes, D]
         if over_batch.shape[1] < 2:
             raise ValueError("variance and covariance over the batch need at least 2 clips, got 1: use a larger batch.")
+        centred = latent - over_batch.mean(1)  # [B, T, D], without the mean of every time step
+        pairs = max(latent.shape[-1] - 1, 1)  # entries off the diagonal for each of the D that VICReg divides by
         compute = {
             "loss_var": lambda: hinge_std(over_batch, -2, self.std_margin).mean(),
-            "loss_cov": lambda: off_diagonal_covariance(over_batch).mean(),
+            "loss_cov": lambda: off_diagonal_covariance(over_batch).mean() / pairs,
             "loss_time_sim": lambda: self._reduce(squared_error(before, after).mean(-1), clip.mask),
-            "loss_time_var": lambda: hinge_std(latent, -2, self.std_margin).mean(),
-            "loss_time_cov": lambda: off_diagonal_covariance(latent).mean(),
+            "loss_time_var": lambda: hinge_std(centred, -2, self.std_margin).mean(),
+            "loss_time_cov": lambda: off_diagonal_covariance(centred, centre=False).mean() / pairs,
             "loss_idm": lambda: self._reduce(
                 inverse_error(self._recover(before, after, self.inverse_model_params), clip.action).mean(-1), clip.mask
             ),

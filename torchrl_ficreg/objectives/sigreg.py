@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import nn
 
+from torchrl_ficreg.modules.precision import without_autocast
 from torchrl_ficreg.objectives.epps_pulley import epps_pulley
 
 
@@ -80,7 +81,7 @@ class SIGReg(nn.Module):
             raise ValueError(f"the mask must be {list(latent.shape[:-1])} bool, got {list(mask.shape)} {mask.dtype}.")
         lead = (1, -1) if latent.ndim == 2 or self.unit == "batch_time" else latent.shape[:2]
         mask = None if mask is None else mask.reshape(lead)  # [T, B]
-        with torch.autocast(latent.device.type, enabled=False):
+        with without_autocast(latent.device):
             latent = latent.reshape(*lead, latent.shape[-1])
             latent = latent if latent.dtype == torch.float64 else latent.float()  # [T, B, D]
             if mask is not None:

@@ -58,13 +58,17 @@ def hinge_std(latent: Tensor, dim: int, margin: float = 1.0, eps: float = 1e-4) 
     return (margin - std).clamp_min(0)
 
 
-def off_diagonal_covariance(latent: Tensor) -> Tensor:
+def off_diagonal_covariance(latent: Tensor, *, centre: bool = True) -> Tensor:
     """Mean over dimensions of the squared off-diagonal covariances, [..., N, D] -> [...] (arXiv 2105.04906).
 
     The sum of squares of all off-diagonal entries divided by D.
+
+    Args:
+        latent: [..., N, D].
+        centre: whether to subtract the mean over the N samples; without it second moments take the place of covariances.
     """
     latent = _widen(latent)
-    centred = latent - latent.mean(-2, keepdim=True)  # [..., N, D]
+    centred = latent - latent.mean(-2, keepdim=True) if centre else latent  # [..., N, D]
     samples, dims = latent.shape[-2:]
     covariance = centred.transpose(-2, -1) @ centred / max(samples - 1, 1)  # [..., D, D]
     diagonal = covariance.diagonal(dim1=-2, dim2=-1)  # [..., D]

@@ -129,8 +129,12 @@ class OfflineTrainer(Trainer):
         self.steps_per_epoch = replay_buffer.batches_per_epoch
         if self.steps_per_epoch * replay_buffer.batch_size > len(replay_buffer):
             raise ValueError("the last batch of an epoch is incomplete: make the training buffer with drop_last=True.")
-        if getattr(loss_module, "reduction", "mean") == "none":
-            raise ValueError("a loss with reduction='none' has no single number to descend: build it with 'mean'.")
+        reduction = getattr(loss_module, "reduction", "mean")
+        if reduction != "mean":  # a sum would be divided by accumulate and by the number of processes
+            raise ValueError(
+                f"the trainer averages losses over the parts of a batch and over processes, which needs reduction='mean', got "
+                f"{reduction!r}: build the loss with 'mean'."
+            )
         self.total_steps, self._resumed = epochs * self.steps_per_epoch, False
         self.schedule_steps = (schedule_epochs or epochs) * self.steps_per_epoch
         self.keep_epoch = keep_epoch

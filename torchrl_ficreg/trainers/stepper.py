@@ -21,8 +21,9 @@ class OfflineStepper(OptimizationStepper):
         clip_norm: largest gradient norm over all parameters.
         norms_due: says at which step the gradient norms of the single networks are wanted besides the norm of all.
         accumulate: equal parts of a batch that go through the networks one after another before the one update, to save
-            memory. Statistics over clips (SIGReg, BatchNorm) are those of a part, not of the batch. SIGReg is proportional to
-            the number of clips it sees: multiply its coefficient by ``accumulate`` to keep its weight.
+            memory. Statistics over clips (SIGReg, BatchNorm) are those of a part, not of the batch. SIGReg grows with the
+            number of clips, so accumulation divides its share in the gradient: multiply ``sigreg_coeff`` by ``accumulate``
+            to keep the effective lambda.
 
     Raises:
         FloatingPointError: a loss or a gradient is not finite. No weight is updated; the message names the step, the

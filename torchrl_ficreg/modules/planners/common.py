@@ -13,6 +13,7 @@ from torchrl.modules import SafeModule
 from torchrl.modules.planners import MPCPlannerBase
 
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
+from torchrl_ficreg.modules.feed import require_tensordict
 from torchrl_ficreg.modules.goal_policy import GoalPolicy
 from torchrl_ficreg.modules.memory import keep_freed_memory
 from torchrl_ficreg.modules.planners.bounds import block_bounds, check_bounds
@@ -125,6 +126,7 @@ class LatentPlanner(MPCPlannerBase):
 
     def _plan_from(self, td: TensorDictBase) -> TensorDict:
         """What :meth:`plan` returns for what td holds."""
+        require_tensordict("a planner", td)
         missing = [key for key in (LATENT, GOAL_LATENT) if td.get(key, None) is None]
         if missing:
             raise KeyError(f"the planner reads {LATENT!r} and {GOAL_LATENT!r}; {', '.join(missing)} is missing.")

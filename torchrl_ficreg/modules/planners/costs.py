@@ -12,9 +12,11 @@ import inspect
 from collections.abc import Callable, Sequence
 
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
+
+from torchrl_ficreg.data.schema import LATENT, RECOVERED_ACTION
+from torchrl_ficreg.modules.feed import arrange, feed, NEXT_LATENT, read_output
 
 Cost = Callable[..., torch.Tensor]
 
@@ -90,8 +92,8 @@ class InverseConsistency(nn.Module):
     :class:`CostSum`. A model with a ``history`` H, such as the transformer, judges every step from the last H latents.
 
     Args:
-        inverse_model: reads two latents, writes the recovered action block; see
-            :class:`~torchrl_ficreg.InverseDynamicsModel`. Keep it in ``eval()``.
+        inverse_model: reads two latents, by name as in :class:`~torchrl_ficreg.FICRegLoss`, writes the recovered action
+            block; see :class:`~torchrl_ficreg.InverseDynamicsModel`. Keep it in ``eval()``.
 
     Examples:
         >>> import torch
@@ -103,6 +105,7 @@ class InverseConsistency(nn.Module):
 
     def __init__(self, inverse_model: TensorDictModuleBase) -> None:
         super().__init__()
+        arrange("inverse_model", inverse_model.in_keys, {LATENT: (), NEXT_LATENT: ()})
         self.inverse_model = inverse_model
 
     def forward(
@@ -123,9 +126,9 @@ class InverseConsistency(nn.Module):
     def _recover(self, latent: torch.Tensor, next_latent: torch.Tensor) -> torch.Tensor:
         """Action blocks that the model recovers from latents in whatever dtype; its own, if it was cast."""
         dtype = next((p.dtype for p in self.inverse_model.parameters()), latent.dtype)
-        inputs = (latent.to(dtype), next_latent.to(dtype))
-        judged = self.inverse_model(TensorDict(dict(zip(self.inverse_model.in_keys, inputs))))
-        return judged.get(self.inverse_model.out_keys[0]).to(latent.dtype)
+        inputs = {LATENT: latent.to(dtype), NEXT_LATENT: next_latent.to(dtype)}
+        judged = self.inverse_model(feed("inverse_model", self.inverse_model, inputs))
+        return read_output(self.inverse_model, judged, RECOVERED_ACTION, 0).to(latent.dtype)
 
 
 class CostSum(nn.Module):

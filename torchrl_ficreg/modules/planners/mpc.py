@@ -8,6 +8,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_ficreg.data.schema import ACTION, GOAL_PIXELS, PIXELS
+from torchrl_ficreg.modules.feed import require_tensordict
 from torchrl_ficreg.modules.planners.common import LatentPlanner, PAST_ACTION, PLAN, PLAN_COST, PLAN_SEED
 
 
@@ -48,6 +49,7 @@ class MPCPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """See the class."""
+        require_tensordict("MPCPolicy", tensordict)
         td = tensordict if tensordict.ndim else tensordict.unsqueeze(0)
         memory = self._memory(td)
         used_up = memory["cursor"] >= memory["queue"].shape[1]  # [E]

@@ -22,6 +22,7 @@ from torchrl_ficreg.data.layout import (
     META_FILE,
     OFFSET_DTYPE,
     OFFSETS,
+    parse_index,
     read_header,
     read_index,
     sync_directory,
@@ -36,11 +37,12 @@ class EpisodeWriter:
 
     An episode is *committed* by its index line, which is written only after its rows are on disk::
 
-        index line without its end -> rows -> pixels, action, state files -> fsync -> end of the line -> fsync
+        index line without its end -> fsync -> rows -> pixels, action, state files -> fsync -> end of the line -> fsync
 
     A crash therefore loses at most the episode being appended. Opening the directory again cuts every file
     back to the last committed episode, and :attr:`num_episodes` says where to continue: a collection that
-    derives episode k from ``(seed, k)`` can simply be run again and never repeats or skips one.
+    derives episode k from ``(seed, k)`` can simply be run again and never repeats or skips one. An episode that lacks
+    nothing but the end of its line is committed instead, after its checksums were compared.
 
     Nothing is cut before the checksums of committed episodes were compared, and never more than one unfinished
     episode. A complete dataset is not opened for writing at all, so it may lie on a read-only file system.
@@ -168,6 +170,7 @@ class EpisodeWriter:
         line, (content, blob_bytes) = entry.to_line(), self._to_files(episode)
         try:
             write_all(self._index, line.removesuffix(b"\n"))  # tells the next opening how much a crash may leave behind
+            os.fsync(self._index)
             for name, rows in content.items():
                 write_all(self._files[name], rows)
             for descriptor in self._files.values():
@@ -264,6 +267,13 @@ class EpisodeWriter:
         self._header = header
         self._check_excess(entries)
         self._open_data(header)
+        if (last := self._whole_but_for_its_end()) is not None:
+            write_all(self._index, b"\n")
+            os.fsync(self._index)
+            self.num_episodes, self.num_steps = last.episode, last.stop
+            self._index_bytes = os.fstat(self._index).st_size
+            if header.frames != "raw":
+                self._blob_bytes = os.fstat(self._files[BLOB]).st_size
         self._truncate()
         if self.target_episodes != header.target_episodes:
             self._header = header.with_target(self.target_episodes)
@@ -275,16 +285,52 @@ class EpisodeWriter:
         Raises:
             ValueError: there is more behind the last committed episode.
         """
+        if not entries and min(self._rows_behind()) < 2:  # not even one episode is whole
+            return
         most = self._unfinished_rows(entries)
         image = self._header.row_bytes(PIXELS) + 1024  # lossless images are hardly larger than what they hold
         for name, committed in self._sizes().items():
-            row = {BLOB: image, OFFSETS: OFFSET_DTYPE.itemsize}.get(name) or self._header.row_bytes(name.split(".")[0])
+            row = image if name == BLOB else self._row_bytes(name)
             excess = (self.path / name).stat().st_size - committed
             if excess > most * row:
                 raise ValueError(
                     f"{self.path / name} holds {excess} bytes that no committed episode owns, more than one unfinished "
                     f"episode: {META_FILE} or {INDEX_FILE} is damaged. Nothing was changed: restore them."
                 )
+
+    def _whole_but_for_its_end(self) -> IndexEntry | None:
+        """The episode after the committed ones, where nothing is missing but the end of its index line.
+
+        Raises:
+            ValueError: its line is torn although all its rows are there. No crash leaves that: the line is on the disk
+                before them.
+        """
+        index, rows = read_bytes(self.path / INDEX_FILE), self._rows_behind()
+        if len(index) == self._index_bytes or len(rows) > 1 or not min(rows).is_integer() or min(rows) < 2:
+            return None
+        try:
+            found, _ = parse_index(index + b"\n", self.path / INDEX_FILE)
+        except ValueError as error:
+            raise ValueError(
+                f"{self.path / INDEX_FILE} ends in a torn line, and the {min(rows):.0f} rows of its episode are there: "
+                "restore the file, or delete the torn line to record that episode again. Nothing was changed."
+            ) from error
+        if {found[-1].length} != rows or len(found) > self._header.target_episodes:
+            return None
+        store = EpisodeStore(self._header, found, None, self.path, num_threads=self.num_threads)
+        try:
+            store.check_episode(found[-1])
+        except ValueError:
+            return None
+        return found[-1]
+
+    def _rows_behind(self) -> set[float]:
+        """How many rows each data file holds behind the last committed episode."""
+        sizes = {name: committed for name, committed in self._sizes().items() if name != BLOB and self._row_bytes(name)}
+        return {((self.path / name).stat().st_size - sizes[name]) / self._row_bytes(name) for name in sizes}
+
+    def _row_bytes(self, name: str) -> int:
+        return OFFSET_DTYPE.itemsize if name == OFFSETS else self._header.row_bytes(name.split(".")[0])
 
     def _unfinished_rows(self, entries: list[IndexEntry]) -> int:
         """The most rows that one unfinished episode can have left behind."""

@@ -454,21 +454,26 @@ def test_episodes_without_a_state_are_stored_and_opened(tmp_path, make_episode, 
 
 @pytest.mark.parametrize("missing", range(1, 82, 8))
 @pytest.mark.parametrize("number", [1, 3])
-def test_a_torn_line_behind_which_the_rows_are_whole_costs_no_episode(record, meta, number, missing):
+def test_a_torn_line_behind_which_the_rows_are_whole_costs_no_episode(tmp_path, collect, meta, frames, number, missing):
     """The line is on the disk before the rows: where they are whole the index was damaged, and no crash cut it short."""
-    path = record([20] * number)
+    collect(tmp_path, number)
+    before = content(tmp_path)
+    with open(tmp_path / "episodes.jsonl", "r+b") as file:
+        file.truncate(len(before["episodes.jsonl"]) - missing)
+    with EpisodeWriter(tmp_path, target_episodes=number, meta=meta, frames=frames) as writer:
+        assert writer.complete
+    assert content(tmp_path) == before
+
+
+def test_a_torn_line_that_does_not_fit_the_rows_is_refused(record, meta):
+    path = record([20, 20])
     index = (path / "episodes.jsonl").read_bytes()
-    (path / "episodes.jsonl").write_bytes(index[:-missing])
+    first, second = index.splitlines(keepends=True)
+    (path / "episodes.jsonl").write_bytes(first + second[:-20].replace(b'"length": 20', b'"length": 21'))
     before = content(path)
-    try:
-        with EpisodeWriter(path, target_episodes=number, meta=meta) as writer:
-            assert writer.complete  # nothing but the end of the line was missing
-    except ValueError as error:
-        assert "Nothing was changed" in str(error) and ("torn line" in str(error) or number == 1)
-        assert missing > 1 and content(path) == before
-    else:
-        assert missing == 1 and content(path) == {**before, "episodes.jsonl": index}
-        EpisodeStore.open(path, verify="full")
+    with pytest.raises(ValueError, match="torn line that does not fit the 20 rows"):
+        EpisodeWriter(path, target_episodes=2, meta=meta)
+    assert content(path) == before
 
 
 def test_a_whole_line_behind_which_other_rows_lie_is_no_episode(record, meta, make_episode):

@@ -22,9 +22,9 @@ from torchrl_ficreg.data.layout import (
     META_FILE,
     OFFSET_DTYPE,
     OFFSETS,
-    parse_index,
     read_header,
     read_index,
+    read_offsets,
     sync_directory,
     write_header,
 )
@@ -41,8 +41,8 @@ class EpisodeWriter:
 
     A crash therefore loses at most the episode being appended. Opening the directory again cuts every file
     back to the last committed episode, and :attr:`num_episodes` says where to continue: a collection that
-    derives episode k from ``(seed, k)`` can simply be run again and never repeats or skips one. An episode that lacks
-    nothing but the end of its line is committed instead, after its checksums were compared.
+    derives episode k from ``(seed, k)`` can simply be run again and never repeats or skips one. An episode whose
+    rows are all there and whose line is a part of what belongs there is committed instead.
 
     Nothing is cut before the checksums of committed episodes were compared, and never more than one unfinished
     episode. A complete dataset is not opened for writing at all, so it may lie on a read-only file system.
@@ -265,15 +265,15 @@ class EpisodeWriter:
             if header.frames != "raw":
                 self._blob_bytes = store.blob_bytes
         self._header = header
+        if (last := self._episode_of_torn_line(entries)) is not None:
+            write_all(self._index, last.to_line()[os.fstat(self._index).st_size - self._index_bytes :])
+            os.fsync(self._index)
+            entries, self.num_episodes, self.num_steps = [*entries, last], last.episode, last.stop
+            self._index_bytes += len(last.to_line())
+            if header.frames != "raw":
+                self._blob_bytes = int(read_offsets(self.path, last.stop)[-1])
         self._check_excess(entries)
         self._open_data(header)
-        if (last := self._whole_but_for_its_end()) is not None:
-            write_all(self._index, b"\n")
-            os.fsync(self._index)
-            self.num_episodes, self.num_steps = last.episode, last.stop
-            self._index_bytes = os.fstat(self._index).st_size
-            if header.frames != "raw":
-                self._blob_bytes = os.fstat(self._files[BLOB]).st_size
         self._truncate()
         if self.target_episodes != header.target_episodes:
             self._header = header.with_target(self.target_episodes)
@@ -298,31 +298,33 @@ class EpisodeWriter:
                     f"episode: {META_FILE} or {INDEX_FILE} is damaged. Nothing was changed: restore them."
                 )
 
-    def _whole_but_for_its_end(self) -> IndexEntry | None:
-        """The episode after the committed ones, where nothing is missing but the end of its index line.
+    def _episode_of_torn_line(self, entries: list[IndexEntry]) -> IndexEntry | None:
+        """The episode after the committed ones, where all its rows are there and a part of its index line.
+
+        A crash leaves a whole line before the first row: a torn one with all rows is damage, which the rows can mend.
 
         Raises:
-            ValueError: its line is torn although all its rows are there. No crash leaves that: the line is on the disk
-                before them.
+            ValueError: a torn line that is no part of what the rows ask for.
         """
-        index, rows = read_bytes(self.path / INDEX_FILE), self._rows_behind()
-        if len(index) == self._index_bytes or len(rows) > 1 or not min(rows).is_integer() or min(rows) < 2:
+        torn, behind = read_bytes(self.path / INDEX_FILE)[self._index_bytes :], self._rows_behind()
+        rows = int(min(behind))
+        if not torn or behind != {rows} or rows < 2 or self.num_episodes >= self._header.target_episodes:
             return None
+        entry = IndexEntry(self.num_episodes + 1, self.num_steps, rows, 0, 0)
         try:
-            found, _ = parse_index(index + b"\n", self.path / INDEX_FILE)
-        except ValueError as error:
+            store = EpisodeStore(self._header, [*entries, entry], None, self.path, num_threads=self.num_threads)
+            crc, pixels_crc = checksums(store.stored(entry))
+        except ValueError:  # images that are none
+            return None
+        line = entry._replace(crc=crc, pixels_crc=pixels_crc).to_line()
+        if line.startswith(torn):
+            return entry._replace(crc=crc, pixels_crc=pixels_crc)
+        if not torn.endswith(b"}"):
             raise ValueError(
-                f"{self.path / INDEX_FILE} ends in a torn line, and the {min(rows):.0f} rows of its episode are there: "
-                "restore the file, or delete the torn line to record that episode again. Nothing was changed."
-            ) from error
-        if {found[-1].length} != rows or len(found) > self._header.target_episodes:
-            return None
-        store = EpisodeStore(self._header, found, None, self.path, num_threads=self.num_threads)
-        try:
-            store.check_episode(found[-1])
-        except ValueError:
-            return None
-        return found[-1]
+                f"{self.path / INDEX_FILE} ends in a torn line that does not fit the {rows} rows of its episode: restore the "
+                "file, or delete that line to record the episode again. Nothing was changed."
+            )
+        return None
 
     def _rows_behind(self) -> set[float]:
         """How many rows each data file holds behind the last committed episode."""

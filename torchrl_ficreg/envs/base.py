@@ -57,11 +57,11 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         terminate_on_success: bool = True,
         render_mode: str | None = "rgb_array",
     ) -> None:
-        if not isinstance(image_size, int) or isinstance(image_size, bool) or image_size < 1:
+        if not isinstance(image_size, (int, np.integer)) or isinstance(image_size, bool) or image_size < 1:
             raise ValueError(f"image_size must be a positive integer, got {image_size!r}.")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}.")
-        self.image_size = image_size
+        self.image_size = int(image_size)
         self.terminate_on_success = terminate_on_success
         self.render_mode = render_mode
         picture = spaces.Box(0, 255, (3, image_size, image_size), np.uint8)

@@ -38,7 +38,9 @@ from torchrl_ficreg import (
 from torchrl_ficreg._utils import write_atomic
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.data.frames import check_frame_format
+from torchrl_ficreg.data.schema import STATE
 from torchrl_ficreg.envs import make_env
+from torchrl_ficreg.envs.registry import find_entry
 from torchrl_ficreg.evaluation import Evaluation, evaluate_mpc, StartGoalPairs, UniformPolicy
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
 from torchrl_ficreg.modules.precision import autocast, Precision, uses_bf16
@@ -176,6 +178,22 @@ def check_card(cfg: DictConfig, dataset: OfflineTrajectories) -> None:
         raise ValueError(f"{where} notes env={card.env} and env_kwargs={kwargs}, which make no environment: {error}") from error
     if action_dim != card.action_dim:
         raise ValueError(f"{where} has actions of {card.action_dim} numbers, its environment {card.env} takes {action_dim}.")
+
+
+def check_pairs(pairs: StartGoalPairs, env_kwargs: dict[str, Any], data: Path) -> None:
+    """Finds out before the training whether the environment accepts all starts and goals.
+
+    Raises:
+        ValueError: it does not.
+    """
+    env = find_entry(pairs.env).load_env()(**env_kwargs)
+    try:
+        for state in (*pairs.start_state, *pairs.goal_state):
+            env.check_state(STATE, state)
+    except ValueError as error:
+        raise ValueError(f"{data} holds states that {pairs.env} cannot be in ({error}): correct its env, or convert it again.") from error
+    finally:
+        env.close()
 
 
 def evaluate_beside_random(

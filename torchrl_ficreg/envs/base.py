@@ -133,7 +133,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         if unknown:
             raise ValueError(f"unknown reset options {sorted(unknown)}: use {STATE!r} and {GOAL_STATE!r}.")
         # Checked before anything changes, so that a refused reset leaves the running episode intact.
-        given = {key: self._check_state(key, options[key]) for key in options}
+        given = {key: self.check_state(key, options[key]) for key in options}
         super().reset(seed=seed)
         state = given[STATE] if STATE in given else self._sample_state(self.np_random)
         goal = given[GOAL_STATE] if GOAL_STATE in given else self._sample_goal(self.np_random, state)
@@ -174,6 +174,29 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         terminated = success and self.terminate_on_success
         return self._observe(), float(success), terminated, False, self._info(success)
 
+    def check_state(self, name: str, value: Any) -> np.ndarray:
+        """Checks a state that an episode is to begin or end at, and changes nothing.
+
+        Args:
+            name: of the state, for messages.
+            value: [S].
+
+        Returns:
+            the state, [S] float64, a copy.
+
+        Raises:
+            ValueError: a wrong shape, not finite, or not legal.
+        """
+        state = np.array(value, dtype=np.float64)  # a copy: the caller's array stays his
+        if state.shape != self.state_space.shape:
+            raise ValueError(f"option {name!r} must have shape {self.state_space.shape}, got {state.shape}.")
+        if not np.isfinite(state).all():
+            raise ValueError(f"option {name!r} must be finite, got {state.tolist()}.")
+        reason = self._why_illegal(state)
+        if reason is not None:
+            raise ValueError(f"option {name!r} {state.tolist()} is not legal: {reason}.")
+        return state
+
     def render(self) -> np.ndarray | None:
         """Draws the scene for people and videos.
 
@@ -198,14 +221,3 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
     @staticmethod
     def _info(success: bool) -> dict[str, np.ndarray]:
         return {SUCCESS: np.array([success])}  # an array: TorchRL's info reader takes no Python scalar
-
-    def _check_state(self, name: str, value: Any) -> np.ndarray:
-        state = np.array(value, dtype=np.float64)  # a copy: the caller's array stays his
-        if state.shape != self.state_space.shape:
-            raise ValueError(f"option {name!r} must have shape {self.state_space.shape}, got {state.shape}.")
-        if not np.isfinite(state).all():
-            raise ValueError(f"option {name!r} must be finite, got {state.tolist()}.")
-        reason = self._why_illegal(state)
-        if reason is not None:
-            raise ValueError(f"option {name!r} {state.tolist()} is not legal: {reason}.")
-        return state

@@ -165,7 +165,7 @@ def quoted(argument: str, sweep: bool = False) -> str:
             raise ValueError(f"{argument!r} cannot be read: settings are written name=value.") from error
         raise ValueError(f"{argument!r} cannot be read: quote the value for the shell and for Hydra, '{marked}'.") from error
     whole = sweep and parsed.is_sweep_override() or parsed.value() is None or isinstance(parsed.value(), str)
-    return marked if is_path and not whole else argument
+    return marked if is_path and not (whole and value == value.strip()) else argument
 
 
 def _let_jobs_import_us() -> None:

@@ -288,7 +288,7 @@ def test_an_inverse_model_that_is_trained_may_judge(scripts, config, overrides):
         ({"action_low": "missing"}, "does not note action_low"),
         ({"env_kwargs": "missing", "action_high": "missing"}, "does not note env_kwargs, action_high"),
         ({"env_kwargs": {"colour": "red"}}, "which make no environment"),
-        ({"env_kwargs": {"collision": 7}}, "which make no environment"),
+        ({"env_kwargs": {"image_size": 7}}, "which make no environment"),
         ({"env_kwargs": ["collision"]}, "expected names and values"),
         ({"env": "three_room"}, "are of three_room, in which these scripts cannot plan"),
         ({"env": "push_t"}, "are of push_t: give env=push_t"),

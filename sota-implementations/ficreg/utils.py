@@ -50,6 +50,7 @@ from torchrl_ficreg.trainers.distributed import launched, world_size
 from torchrl_ficreg.trainers.parallel import check_processes
 
 EASY_START, EASY_RANDOM = 0.2, 0.5  # shares of pairs above which an evaluation tells little
+MOST_LAYERS = 1000  # of the predictor; building more takes minutes even without their memory
 SIGREG_FALL = 0.8  # share of training after which lambda has its last value
 
 
@@ -322,6 +323,8 @@ def check_size(cfg: DictConfig) -> None:
     Raises:
         ValueError: a setting that they refuse, or networks too large for this machine.
     """
+    if cfg.model.predictor_depth > MOST_LAYERS:
+        raise ValueError(f"model.predictor_depth={cfg.model.predictor_depth}: expected at most {MOST_LAYERS} layers.")
     try:
         model, inverse_model = make_networks_without_memory(cfg)
     except RuntimeError as error:

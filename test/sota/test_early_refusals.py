@@ -253,7 +253,7 @@ def test_the_home_folder_is_meant_in_every_setting_that_names_one(scripts, confi
         (["evaluation.num_pairs=100000"], "cannot draw 100000 pairs"),
         (["env.goal_offset=5000", "env.budget=6000"], "cannot draw"),
         (["model.image_size=1000000"], "lower model.image_size=1000000|make no networks"),
-        (["model.predictor_depth=1000000"], "make no networks|lower model"),
+        (["model.predictor_depth=1000000"], "model.predictor_depth=1000000: expected at most 1000 layers"),
         (["method=lewm", "plan.consistency=0.5"], "plan.consistency=0.5 asks the inverse model"),
         (["method=pldm", "method.idm_coeff=0.0", "plan.consistency=0.5"], "asks the inverse model"),
         (["loss.idm_coeff=0.0", "plan.consistency=0.5"], "asks the inverse model"),

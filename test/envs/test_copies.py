@@ -100,9 +100,10 @@ def test_a_picture_size_that_is_no_integer_is_refused(name, size):
 
 
 @pytest.mark.parametrize("name", ["two_room", "push_t"])
-def test_a_picture_size_may_be_an_integer_of_numpy(name):
+def test_sizes_and_seeds_may_be_integers_of_numpy(name):
     env = ENVIRONMENTS[name].load_env()(image_size=np.int64(16))
     assert type(env.image_size) is int and env.reset(seed=0)[0]["pixels"].shape == (3, 16, 16)
+    assert_same(env.reset(seed=np.int64(3))[0], env.reset(seed=3)[0])
     env.close()
 
 

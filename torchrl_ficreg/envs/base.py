@@ -134,7 +134,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
             raise ValueError(f"unknown reset options {sorted(unknown)}: use {STATE!r} and {GOAL_STATE!r}.")
         # Checked before anything changes, so that a refused reset leaves the running episode intact.
         given = {key: self.check_state(key, options[key]) for key in options}
-        super().reset(seed=seed)
+        super().reset(seed=int(seed) if isinstance(seed, np.integer) else seed)
         state = given[STATE] if STATE in given else self._sample_state(self.np_random)
         goal = given[GOAL_STATE] if GOAL_STATE in given else self._sample_goal(self.np_random, state)
         self._set_state(state)

@@ -192,7 +192,7 @@ def check_pairs(pairs: StartGoalPairs, env_kwargs: dict[str, Any], data: Path) -
         for state in (*pairs.start_state, *pairs.goal_state):
             env.check_state(STATE, state)
     except ValueError as error:
-        raise ValueError(f"{data} holds states that {pairs.env} cannot be in ({error}): correct its env, or convert it again.") from error
+        raise ValueError(f"{data} holds states that {pairs.env} cannot be in ({str(error).rstrip('.')}): correct its env, or convert it again.") from error
     finally:
         env.close()
 

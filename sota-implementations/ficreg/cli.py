@@ -38,6 +38,8 @@ CONFIG_DIR = Path(__file__).resolve().parent / "config"
 # Settings that name files and folders: any path is taken as it stands, and ~ is the home folder.
 PATHS = ("source", "target", "dataset", "data_dir", "runs_dir", "resume", "checkpoint", "pairs", "output", "plan.policy")
 
+MOST_CHARACTERS = 1000  # of an error: some libraries quote whole files
+
 # What a user can cause and mend has a message of its own; other errors are named by their kind as well.
 MISTAKES = (ValueError, TypeError, KeyError, ImportError, OSError, FloatingPointError, RuntimeError)
 MISTAKES += (HydraException, OmegaConfBaseException)
@@ -163,7 +165,7 @@ def quoted(argument: str, sweep: bool = False) -> str:
             raise ValueError(f"{argument!r} cannot be read: settings are written name=value.") from error
         raise ValueError(f"{argument!r} cannot be read: quote the value for the shell and for Hydra, '{marked}'.") from error
     whole = sweep and parsed.is_sweep_override() or parsed.value() is None or isinstance(parsed.value(), str)
-    return marked if is_path and not whole else argument
+    return marked if is_path and not (whole and value == value.strip()) else argument
 
 
 def _let_jobs_import_us() -> None:
@@ -292,8 +294,10 @@ def _close_bars() -> None:
 
 
 def _one_line(error: BaseException) -> str:
+    """What to say of an error: its message, and its kind where that is no message of ours; one line of bounded length."""
     text = error.args[0] if isinstance(error, KeyError) and error.args else error
     line, kind = " ".join(str(text).split()), type(error).__name__
+    line = line if len(line) <= MOST_CHARACTERS else f"{line[: MOST_CHARACTERS - 3]}..."
     if isinstance(error, KeyError) and " " not in line:
         line = f"{kind}: {text!r}"
     elif not isinstance(error, MISTAKES) or isinstance(error, RecursionError) or not line:

@@ -57,7 +57,8 @@ def find_dataset(cfg: DictConfig) -> Path:
             f"dataset={cfg.dataset} has frames of {size} pixels: give model.image_size={size}, or convert it with "
             f"image_size={cfg.model.image_size}."
         )
-    ours, theirs = OmegaConf.to_container(cfg.env.kwargs), store.header.meta.get("env_kwargs", {})
+    ours, theirs = OmegaConf.to_container(cfg.env.kwargs), store.header.meta.get("env_kwargs")
+    theirs = theirs if isinstance(theirs, dict) else {}  # check_card() refuses what is no mapping
     differ = [f"{key}={theirs[key]}, not {value}" for key, value in ours.items() if theirs.get(key, value) != value]
     if differ:
         torchrl_logger.warning(

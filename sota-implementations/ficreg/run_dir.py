@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointRotation
 from utils import flatten
 
-from torchrl_ficreg._utils import lock_file, write_atomic
+from torchrl_ficreg._utils import lock_file, MOST_JSON_BYTES, read_bytes, write_atomic
 from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, find_checkpoint, read_card
 from torchrl_ficreg.trainers.offline import METRICS
 
@@ -51,6 +51,7 @@ _FREE = ("collect.", "distributed.", "device", "evaluation.", "plan.", "logger."
 _FREE += ("optim.checkpoint_activations", "optim.compile")  # which change no number
 _FREE += ("env.budget", "env.goal_offset", "env.num_workers", "env.state_unit")
 _PLACES = ("data_dir", "dataset")
+_DAMAGE = (ValueError, TypeError, AttributeError, AssertionError, RecursionError)  # what a damaged config.yaml leads to
 _FROM_RUN_DIR = "from_run_dir"  # of config.yaml; the other settings are those of the command line
 
 
@@ -80,14 +81,14 @@ def _read_config(path: Path) -> dict[str, Any]:
         ValueError: they cannot be read.
     """
     try:
-        text = path.read_text()
+        text = read_bytes(path, most=MOST_JSON_BYTES).decode()
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
             raise ValueError("it has aliases, of which a few lines can stand for gigabytes")
         config = OmegaConf.to_container(OmegaConf.create(text))
         if not isinstance(config, dict) or "model" not in config:
             raise ValueError("it has no settings of a model")
-    except (ValueError, TypeError, AttributeError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
-        reason = " ".join(str(error).split())[:150]
+    except (*_DAMAGE, yaml.YAMLError, OmegaConfBaseException) as error:
+        reason = " ".join(str(error).split())[:150] or "it holds no settings"
         raise ValueError(f"{path} is damaged ({reason}): restore it, or give another name=...") from error
     return config
 

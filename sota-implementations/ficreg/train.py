@@ -29,6 +29,7 @@ from run_dir import check_run_dir, claim_run_dir, find_start
 from utils import (
     add_hooks,
     check_card,
+    check_pairs,
     check_settings,
     encoder_of,
     evaluate_beside_random,
@@ -205,6 +206,7 @@ def draw_tests(cfg: DictConfig, data: Path) -> list[tuple[StartGoalPairs, int, s
             pairs = StartGoalPairs.draw(held_out, cfg.env.name, count, offset, seed)
         else:
             pairs = StartGoalPairs.frozen(manifest, held_out, cfg.env.name, count, offset, seed)
+        check_pairs(pairs, make_card(cfg, held_out).env_kwargs, data)
         tests.append((pairs, budget, f"goals_{offset}_steps_ahead_within_{budget}"))
     return tests
 

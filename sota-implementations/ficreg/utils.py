@@ -38,7 +38,9 @@ from torchrl_ficreg import (
 from torchrl_ficreg._utils import write_atomic
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.data.frames import check_frame_format
+from torchrl_ficreg.data.schema import STATE
 from torchrl_ficreg.envs import make_env
+from torchrl_ficreg.envs.registry import find_entry
 from torchrl_ficreg.evaluation import Evaluation, evaluate_mpc, StartGoalPairs, UniformPolicy
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
 from torchrl_ficreg.modules.precision import autocast, check_precision, describe_processor, Precision
@@ -48,6 +50,7 @@ from torchrl_ficreg.trainers.distributed import launched, world_size
 from torchrl_ficreg.trainers.parallel import check_processes
 
 EASY_START, EASY_RANDOM = 0.2, 0.5  # shares of pairs above which an evaluation tells little
+MOST_LAYERS = 1000  # of the predictor; building more takes minutes even without their memory
 SIGREG_FALL = 0.8  # share of training after which lambda has its last value
 
 
@@ -178,6 +181,22 @@ def check_card(cfg: DictConfig, dataset: OfflineTrajectories) -> None:
         raise ValueError(f"{where} has actions of {card.action_dim} numbers, its environment {card.env} takes {action_dim}.")
 
 
+def check_pairs(pairs: StartGoalPairs, env_kwargs: dict[str, Any], data: Path) -> None:
+    """Finds out before the training whether the environment accepts all starts and goals.
+
+    Raises:
+        ValueError: it does not.
+    """
+    env = find_entry(pairs.env).load_env()(**env_kwargs)
+    try:
+        for state in (*pairs.start_state, *pairs.goal_state):
+            env.check_state(STATE, state)
+    except ValueError as error:
+        raise ValueError(f"{data} holds states that {pairs.env} cannot be in ({str(error).rstrip('.')}): correct its env, or convert it again.") from error
+    finally:
+        env.close()
+
+
 def evaluate_beside_random(
     policy: MPCPolicy, pairs: StartGoalPairs, card: ModelCard, *, record: int, num_workers: int, **settings: Any
 ) -> tuple[Evaluation, Evaluation]:
@@ -304,6 +323,8 @@ def check_size(cfg: DictConfig) -> None:
     Raises:
         ValueError: a setting that they refuse, or networks too large for this machine.
     """
+    if cfg.model.predictor_depth > MOST_LAYERS:
+        raise ValueError(f"model.predictor_depth={cfg.model.predictor_depth}: expected at most {MOST_LAYERS} layers.")
     try:
         model, inverse_model = make_networks_without_memory(cfg)
     except RuntimeError as error:

@@ -131,7 +131,7 @@ def test_a_kill_while_resuming_is_harmless_too(tmp_path, collect, make_episode, 
     collect(tmp_path / "unbroken")
     path = tmp_path / "killed"
     attempts, before = 0, 0
-    resuming, episode = len(DATA[frames]) + 1, 2 * (len(DATA[frames]) + 1) + 1  # system calls
+    resuming, episode = len(DATA[frames]) + 1, 2 * (len(DATA[frames]) + 1) + 2  # system calls
     while run_killed(kill_at, resuming + episode + 1, collect, path):  # commits one at a time, or dies resuming
         episodes = check_prefix(path, make_episode)
         assert episodes >= before
@@ -203,6 +203,7 @@ def test_rows_are_on_disk_before_their_index_line_is_written(tmp_path, make_epis
         writer.append(make_episode(2))
     data, count = DATA[frames], len(DATA[frames])
     assert log[0] == ("write", "episodes.jsonl")  # a line without its end, which does not count yet
+    assert log.pop(1) == ("fsync", "episodes.jsonl")  # also a power cut leaves it behind, to say how long the episode was
     assert sorted(log[1 : count + 1]) == sorted(("write", name) for name in data)
     assert sorted(log[count + 1 : 2 * count + 1]) == sorted(("fsync", name) for name in data)
     assert log[2 * count + 1 :] == [("write", "episodes.jsonl"), ("fsync", "episodes.jsonl")]
@@ -363,10 +364,6 @@ def test_a_dataset_that_lost_a_file_is_not_cut_to_nothing(tmp_path, make_episode
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-if __name__ == "__main__":
-    pytest.main([__file__])
-
-
 def test_damaged_notes_never_cut_data(record, meta):
     """Header and index are what says how much is data: where they disagree with the files, nothing is changed."""
 
@@ -453,3 +450,59 @@ def test_episodes_without_a_state_are_stored_and_opened(tmp_path, make_episode, 
     assert store.num_episodes == 2 and store.arrays["state"].shape == (40, 0)
     with pytest.raises(ValueError, match="holds no state"):
         store.require_state()
+
+
+@pytest.mark.parametrize("missing", range(1, 82, 8))
+@pytest.mark.parametrize("number", [1, 3])
+def test_a_torn_line_behind_which_the_rows_are_whole_costs_no_episode(tmp_path, collect, meta, frames, number, missing):
+    """The line is on the disk before the rows: where they are whole the index was damaged, and no crash cut it short."""
+    collect(tmp_path, number)
+    before = content(tmp_path)
+    with open(tmp_path / "episodes.jsonl", "r+b") as file:
+        file.truncate(len(before["episodes.jsonl"]) - missing)
+    with EpisodeWriter(tmp_path, target_episodes=number, meta=meta, frames=frames) as writer:
+        assert writer.complete
+    assert content(tmp_path) == before
+
+
+def test_a_torn_line_that_does_not_fit_the_rows_is_refused(record, meta):
+    path = record([20, 20])
+    index = (path / "episodes.jsonl").read_bytes()
+    first, second = index.splitlines(keepends=True)
+    (path / "episodes.jsonl").write_bytes(first + second[:-20].replace(b'"length": 20', b'"length": 21'))
+    before = content(path)
+    with pytest.raises(ValueError, match="torn line that does not fit the 20 rows"):
+        EpisodeWriter(path, target_episodes=2, meta=meta)
+    assert content(path) == before
+
+
+def test_a_whole_line_behind_which_other_rows_lie_is_no_episode(record, meta, make_episode):
+    """As after a power cut that left zeros where the rows were to be."""
+    path = record([20, 20])
+    index, rows = (path / "episodes.jsonl").read_bytes(), (path / "pixels.memmap").read_bytes()
+    (path / "episodes.jsonl").write_bytes(index[:-1])
+    (path / "pixels.memmap").write_bytes(rows[: len(rows) // 2] + bytes(len(rows) // 2))
+    with EpisodeWriter(path, target_episodes=2, meta=meta) as writer:
+        assert writer.num_episodes == 1
+        writer.append(make_episode(2))
+    assert (path / "pixels.memmap").read_bytes() == rows
+
+
+@pytest.mark.parametrize("line", ["", '{"episode": 1, "st', "whole"])
+def test_a_first_episode_cut_by_a_power_failure_is_recorded_again(record, meta, make_episode, line):
+    """However long it was, and whatever the notes say of episodes: it is not whole, so nothing is lost."""
+    path = record([20])
+    index, files = (path / "episodes.jsonl").read_bytes(), content(path)
+    (path / "episodes.jsonl").write_bytes(index[:-1] if line == "whole" else line.encode())
+    with open(path / "pixels.memmap", "r+b") as file:
+        file.truncate(13 * 48 + 5)
+    for name in ("action.memmap", "state.memmap"):
+        (path / name).write_bytes(b"")
+    with EpisodeWriter(path, target_episodes=1, meta=meta) as writer:
+        assert writer.num_episodes == 0
+        writer.append(make_episode(1))
+    assert content(path) == files
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from torchrl_ficreg.envs.actors import Actors
+from torchrl_ficreg.envs.workers import ordered_map
 
 
 class ComplicatedError(Exception):
@@ -102,6 +103,7 @@ def test_workers_end_with_a_killed_parent():
     script = """
 import os, signal
 from torchrl_ficreg.envs.actors import Actors
+from torchrl_ficreg.envs.workers import ordered_map
 from test_actors import Counter
 if __name__ == "__main__":
     actors = Actors(Counter, 1)
@@ -133,3 +135,26 @@ def test_a_stopped_worker_is_warned_of_and_given_up(monkeypatch):
             actors.call("add", {0: (1,), 1: (1,)})
     assert actors.closed
     assert wait_until(lambda: all(map(gone, pids)))
+
+
+@pytest.fixture
+def few_handles():
+    """``few_handles(n)`` leaves n file handles to this process; the former limit holds again afterwards."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+
+    def limit(left):
+        free = os.open(os.devnull, os.O_RDONLY)  # the lowest number there is
+        os.close(free)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (free + left, hard))
+
+    yield limit
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.mark.parametrize("start", [lambda: Actors(Counter, 4), lambda: list(ordered_map(abs, range(8), num_workers=4))])
+@pytest.mark.parametrize("left", [1, 3, 8])
+def test_a_lack_of_file_handles_is_said_and_is_no_death(few_handles, start, left):
+    few_handles(left)
+    with pytest.raises(RuntimeError, match="too many open files to run the worker processes: raise the limit"):
+        start()

@@ -99,6 +99,29 @@ def test_a_picture_size_that_is_no_integer_is_refused(name, size):
         ENVIRONMENTS[name].load_env()(image_size=size)
 
 
+@pytest.mark.parametrize("name", ["two_room", "push_t"])
+def test_sizes_and_seeds_may_be_integers_of_numpy(name):
+    env = ENVIRONMENTS[name].load_env()(image_size=np.int64(16))
+    assert type(env.image_size) is int and env.reset(seed=0)[0]["pixels"].shape == (3, 16, 16)
+    assert_same(env.reset(seed=np.int64(3))[0], env.reset(seed=3)[0])
+    env.close()
+
+
+def test_a_scene_that_is_never_restored_keeps_no_endless_memory(monkeypatch):
+    monkeypatch.setattr("torchrl_ficreg.envs.push_t.physics.MOST_CALLS", 20)
+    env = ENVIRONMENTS["push_t"].load_env()(image_size=8)
+    env.reset(seed=0)
+    for _ in range(50):
+        env.step(np.zeros(2))
+    assert len(env._world._journal) <= 21
+    for copier in COPIERS.values():
+        with pytest.raises(RuntimeError, match="more than 20 times since its last set_state.* reset it first"):
+            copier(env)
+    env.reset()
+    twin = copy.deepcopy(env)
+    assert_same(env.step(np.ones(2))[0], twin.step(np.ones(2))[0])
+
+
 @pytest.mark.parametrize("name", ["num_envs", "num_workers", "seed", "max_episode_steps"])
 @pytest.mark.parametrize("value", [True, 2.0, "2"])
 def test_numbers_of_another_type_are_refused(name, value):

@@ -228,6 +228,14 @@ gl.import_simulator("dm_control.mujoco")
     assert python(code, tmp_path).stderr == ""
 
 
+@needs_gl
+def test_a_context_that_outlives_the_names_of_its_module_causes_no_noise(monkeypatch):
+    """An interpreter that ends clears the names of modules, and deletes what is left only then."""
+    context = object.__new__(gl._context_class("egl"))
+    monkeypatch.setattr(gl, "_was_forked", None)
+    context.__del__()
+
+
 def works_with(backend: str) -> bool:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MUJOCO_GL", backend)

@@ -81,6 +81,11 @@ class Header:
         """Bytes of one row of ``key``."""
         return DTYPES[key].itemsize * prod(self.shapes[key])
 
+    @property
+    def shapes_crc(self) -> int:
+        """crc32 of the row shapes: rows of one size can have several, between which no other checksum tells."""
+        return zlib.crc32(json.dumps({key: list(self.shapes[key]) for key in DTYPES}).encode())
+
     def with_target(self, target_episodes: int) -> Header:
         """The same header with another target."""
         return replace(self, target_episodes=target_episodes)
@@ -94,6 +99,7 @@ class Header:
             "target_episodes": self.target_episodes,
             "shapes": {key: list(shape) for key, shape in self.shapes.items()},
             "dtypes": {key: dtype.str for key, dtype in DTYPES.items()},
+            "shapes_crc": self.shapes_crc,
             "meta": self.meta,
         }
         return json.dumps(content, indent=2, sort_keys=True) + "\n"
@@ -127,7 +133,10 @@ class Header:
             if not good:
                 got = repr(content[name])[:120] if name in content else "nothing"
                 raise ValueError(f"{where} lacks or garbles the field {name!r}, {got}: collect or copy it again.")
-        return cls(target, {key: tuple(shapes[key]) for key in DTYPES}, content["meta"], frames)
+        header = cls(target, {key: tuple(shapes[key]) for key in DTYPES}, content["meta"], frames)
+        if content.get("shapes_crc", header.shapes_crc) != header.shapes_crc:  # absent from older datasets
+            raise ValueError(f"{where}: the row shapes {shapes} do not match their checksum: collect or copy it again.")
+        return header
 
 
 def read_header(path: Path) -> Header:

@@ -236,14 +236,18 @@ class EpisodeStore:
             if size < need:
                 raise OSError(f"{file} has shrunk from {need} to {size} bytes: restore it and open the dataset again.")
 
+    def stored(self, entry: IndexEntry) -> dict[str, np.ndarray]:
+        """The rows of an episode, as they are stored."""
+        rows = slice(entry.start, entry.stop)
+        return {**{key: array[rows] for key, array in self.arrays.items()}, PIXELS: self.frames(rows)}
+
     def check_episode(self, entry: IndexEntry) -> None:
         """Compares the checksums of one episode, and checks that its numbers are finite.
 
         Raises:
             ValueError: they differ, or an action or state is not finite.
         """
-        rows = slice(entry.start, entry.stop)
-        episode = {**{key: array[rows] for key, array in self.arrays.items()}, PIXELS: self.frames(rows)}
+        episode = self.stored(entry)
         if checksums(episode) != (entry.crc, entry.pixels_crc):
             raise ValueError(
                 f"{self.path} is damaged: the bytes of episode {entry.episode} do not match their checksum: "

@@ -24,6 +24,7 @@ from torchrl_ficreg.data.layout import (
     OFFSETS,
     read_header,
     read_index,
+    read_offsets,
     sync_directory,
     write_header,
 )
@@ -36,11 +37,12 @@ class EpisodeWriter:
 
     An episode is *committed* by its index line, which is written only after its rows are on disk::
 
-        index line without its end -> rows -> pixels, action, state files -> fsync -> end of the line -> fsync
+        index line without its end -> fsync -> rows -> pixels, action, state files -> fsync -> end of the line -> fsync
 
     A crash therefore loses at most the episode being appended. Opening the directory again cuts every file
     back to the last committed episode, and :attr:`num_episodes` says where to continue: a collection that
-    derives episode k from ``(seed, k)`` can simply be run again and never repeats or skips one.
+    derives episode k from ``(seed, k)`` can simply be run again and never repeats or skips one. An episode whose
+    rows are all there and whose line is a part of what belongs there is committed instead.
 
     Nothing is cut before the checksums of committed episodes were compared, and never more than one unfinished
     episode. A complete dataset is not opened for writing at all, so it may lie on a read-only file system.
@@ -168,6 +170,7 @@ class EpisodeWriter:
         line, (content, blob_bytes) = entry.to_line(), self._to_files(episode)
         try:
             write_all(self._index, line.removesuffix(b"\n"))  # tells the next opening how much a crash may leave behind
+            os.fsync(self._index)
             for name, rows in content.items():
                 write_all(self._files[name], rows)
             for descriptor in self._files.values():
@@ -262,6 +265,13 @@ class EpisodeWriter:
             if header.frames != "raw":
                 self._blob_bytes = store.blob_bytes
         self._header = header
+        if (last := self._episode_of_torn_line(entries)) is not None:
+            write_all(self._index, last.to_line()[os.fstat(self._index).st_size - self._index_bytes :])
+            os.fsync(self._index)
+            entries, self.num_episodes, self.num_steps = [*entries, last], last.episode, last.stop
+            self._index_bytes += len(last.to_line())
+            if header.frames != "raw":
+                self._blob_bytes = int(read_offsets(self.path, last.stop)[-1])
         self._check_excess(entries)
         self._open_data(header)
         self._truncate()
@@ -275,16 +285,54 @@ class EpisodeWriter:
         Raises:
             ValueError: there is more behind the last committed episode.
         """
+        if not entries and min(self._rows_behind()) < 2:  # not even one episode is whole
+            return
         most = self._unfinished_rows(entries)
         image = self._header.row_bytes(PIXELS) + 1024  # lossless images are hardly larger than what they hold
         for name, committed in self._sizes().items():
-            row = {BLOB: image, OFFSETS: OFFSET_DTYPE.itemsize}.get(name) or self._header.row_bytes(name.split(".")[0])
+            row = image if name == BLOB else self._row_bytes(name)
             excess = (self.path / name).stat().st_size - committed
             if excess > most * row:
                 raise ValueError(
                     f"{self.path / name} holds {excess} bytes that no committed episode owns, more than one unfinished "
                     f"episode: {META_FILE} or {INDEX_FILE} is damaged. Nothing was changed: restore them."
                 )
+
+    def _episode_of_torn_line(self, entries: list[IndexEntry]) -> IndexEntry | None:
+        """The episode after the committed ones, where all its rows are there and a part of its index line.
+
+        A crash leaves a whole line before the first row: a torn one with all rows is damage, which the rows can mend.
+
+        Raises:
+            ValueError: a torn line that is no part of what the rows ask for.
+        """
+        torn, behind = read_bytes(self.path / INDEX_FILE)[self._index_bytes :], self._rows_behind()
+        rows = int(min(behind))
+        if not torn or behind != {rows} or rows < 2 or self.num_episodes >= self._header.target_episodes:
+            return None
+        entry = IndexEntry(self.num_episodes + 1, self.num_steps, rows, 0, 0)
+        try:
+            store = EpisodeStore(self._header, [*entries, entry], None, self.path, num_threads=self.num_threads)
+            crc, pixels_crc = checksums(store.stored(entry))
+        except ValueError:  # images that are none
+            return None
+        line = entry._replace(crc=crc, pixels_crc=pixels_crc).to_line()
+        if line.startswith(torn):
+            return entry._replace(crc=crc, pixels_crc=pixels_crc)
+        if not torn.endswith(b"}"):
+            raise ValueError(
+                f"{self.path / INDEX_FILE} ends in a torn line that does not fit the {rows} rows of its episode: restore the "
+                "file, or delete that line to record the episode again. Nothing was changed."
+            )
+        return None
+
+    def _rows_behind(self) -> set[float]:
+        """How many rows each data file holds behind the last committed episode."""
+        sizes = {name: committed for name, committed in self._sizes().items() if name != BLOB and self._row_bytes(name)}
+        return {((self.path / name).stat().st_size - sizes[name]) / self._row_bytes(name) for name in sizes}
+
+    def _row_bytes(self, name: str) -> int:
+        return OFFSET_DTYPE.itemsize if name == OFFSETS else self._header.row_bytes(name.split(".")[0])
 
     def _unfinished_rows(self, entries: list[IndexEntry]) -> int:
         """The most rows that one unfinished episode can have left behind."""

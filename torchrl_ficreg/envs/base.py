@@ -57,11 +57,11 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         terminate_on_success: bool = True,
         render_mode: str | None = "rgb_array",
     ) -> None:
-        if not isinstance(image_size, int) or isinstance(image_size, bool) or image_size < 1:
+        if not isinstance(image_size, (int, np.integer)) or isinstance(image_size, bool) or image_size < 1:
             raise ValueError(f"image_size must be a positive integer, got {image_size!r}.")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}.")
-        self.image_size = image_size
+        self.image_size = int(image_size)
         self.terminate_on_success = terminate_on_success
         self.render_mode = render_mode
         picture = spaces.Box(0, 255, (3, image_size, image_size), np.uint8)
@@ -133,8 +133,8 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         if unknown:
             raise ValueError(f"unknown reset options {sorted(unknown)}: use {STATE!r} and {GOAL_STATE!r}.")
         # Checked before anything changes, so that a refused reset leaves the running episode intact.
-        given = {key: self._check_state(key, options[key]) for key in options}
-        super().reset(seed=seed)
+        given = {key: self.check_state(key, options[key]) for key in options}
+        super().reset(seed=int(seed) if isinstance(seed, np.integer) else seed)
         state = given[STATE] if STATE in given else self._sample_state(self.np_random)
         goal = given[GOAL_STATE] if GOAL_STATE in given else self._sample_goal(self.np_random, state)
         self._set_state(state)
@@ -174,6 +174,29 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         terminated = success and self.terminate_on_success
         return self._observe(), float(success), terminated, False, self._info(success)
 
+    def check_state(self, name: str, value: Any) -> np.ndarray:
+        """Checks a state that an episode is to begin or end at, and changes nothing.
+
+        Args:
+            name: of the state, for messages.
+            value: [S].
+
+        Returns:
+            the state, [S] float64, a copy.
+
+        Raises:
+            ValueError: a wrong shape, not finite, or not legal.
+        """
+        state = np.array(value, dtype=np.float64)  # a copy: the caller's array stays his
+        if state.shape != self.state_space.shape:
+            raise ValueError(f"option {name!r} must have shape {self.state_space.shape}, got {state.shape}.")
+        if not np.isfinite(state).all():
+            raise ValueError(f"option {name!r} must be finite, got {state.tolist()}.")
+        reason = self._why_illegal(state)
+        if reason is not None:
+            raise ValueError(f"option {name!r} {state.tolist()} is not legal: {reason}.")
+        return state
+
     def render(self) -> np.ndarray | None:
         """Draws the scene for people and videos.
 
@@ -198,14 +221,3 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
     @staticmethod
     def _info(success: bool) -> dict[str, np.ndarray]:
         return {SUCCESS: np.array([success])}  # an array: TorchRL's info reader takes no Python scalar
-
-    def _check_state(self, name: str, value: Any) -> np.ndarray:
-        state = np.array(value, dtype=np.float64)  # a copy: the caller's array stays his
-        if state.shape != self.state_space.shape:
-            raise ValueError(f"option {name!r} must have shape {self.state_space.shape}, got {state.shape}.")
-        if not np.isfinite(state).all():
-            raise ValueError(f"option {name!r} must be finite, got {state.tolist()}.")
-        reason = self._why_illegal(state)
-        if reason is not None:
-            raise ValueError(f"option {name!r} {state.tolist()} is not legal: {reason}.")
-        return state

@@ -312,7 +312,10 @@ def _context_class(backend: str) -> type:
                 self._context = None
 
         def __del__(self) -> None:
-            self.free()
+            try:
+                self.free()
+            except TypeError:  # the names of this module are gone already: the interpreter ends, and GL with it
+                pass
 
     return QuietContext
 

@@ -125,12 +125,11 @@ def _as_array(value: Any, name: str) -> Any:
         TypeError: it holds no numbers.
     """
     if isinstance(value, torch.Tensor):
-        value = value.detach().cpu()
-        value = (value.float() if value.dtype == torch.bfloat16 else value).numpy()
+        value = _to_numpy(value)
     elif not (hasattr(value, "shape") and hasattr(value, "dtype")):
         try:
             whole = value if isinstance(value, Sequence) else list(value)
-            value = np.asarray([_as_array(row, name) for row in whole] if _holds_tensors(whole) else whole)
+            value = np.asarray([_to_numpy(row) for row in whole] if _holds_tensors(whole) else whole)
         except (ValueError, TypeError) as error:
             raise TypeError(f"{name} must be an array of numbers, got a {type(value).__name__} ({error}).") from error
         if name == "pixels" and value.dtype.kind in "iu" and value.size and 0 <= value.min() and value.max() <= 255:
@@ -141,11 +140,18 @@ def _as_array(value: Any, name: str) -> Any:
 
 
 def _holds_tensors(values: Sequence[Any]) -> bool:
-    return len(values) > 0 and isinstance(values[0], torch.Tensor)
+    return len(values) > 0 and all(isinstance(value, torch.Tensor) for value in values)
+
+
+def _to_numpy(value: torch.Tensor) -> np.ndarray:
+    value = value.detach().cpu()
+    return (value.float() if value.dtype == torch.bfloat16 else value).numpy()
 
 
 def _whole_numbers(values: Any, name: str) -> np.ndarray:
-    values = _as_array(values, name)
-    if not np.array_equal(np.asarray(values).astype(np.int64), values):
-        raise ValueError(f"{name} must be whole numbers of rows, got {np.asarray(values).reshape(-1)[:4].tolist()}.")
-    return np.asarray(values).astype(np.int64).reshape(-1)
+    values = np.asarray(_as_array(values, name)).reshape(-1)
+    with np.errstate(invalid="ignore"):  # of a NaN
+        whole = values.astype(np.int64)
+    if not np.array_equal(whole, values):
+        raise ValueError(f"{name} must be whole numbers of rows, got {values[:4].tolist()}.")
+    return whole

@@ -111,7 +111,7 @@ def convert(
     place = Path(target).expanduser()
     if place.exists() and not place.is_dir():
         raise ValueError(f"target={target} is a file: name a folder.")
-    size = (image_size, image_size) if image_size else source.frame_shape
+    size = (int(image_size), int(image_size)) if image_size else source.frame_shape
     count = min(limit or len(source), len(source))
     if source.skipped:
         warnings.warn(f"{source.table.path}: {source.skipped} episodes of fewer than two rows are left out.")
@@ -203,7 +203,7 @@ def _check_arguments(
         raise ValueError(f"the source was opened with env={source.env!r}, got env={env!r}: pass env= to open_source().")
     check_frame_format(frames)
     for name, value in (("image_size", image_size), ("limit", limit)):
-        if value is not None and (not isinstance(value, int) or value < 1):
+        if value is not None and (not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < 1):
             raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
 
 

@@ -33,12 +33,14 @@ ACTION_SCALE = 100.0  # px of target shift per unit of action
 STIFFNESS, DAMPING = 100.0, 20.0  # of the PD law that drives the disc, 1/s^2 and 1/s
 TIME_STEP, SUBSTEPS = 0.01, 10  # s, and how many of them make an environment step
 
+MOST_CALLS = 10_000  # that a copy repeats, 2 s; without a restoration there could be any number of them
+
 
 class PushTWorld:
     """A restorable simulation: the same state and actions give the same bits, whatever happened before.
 
-    A copy or an unpickled world repeats what was done since the last restoration, so that it also has the contacts that
-    the solver remembers and goes on with the same bits.
+    A copy or an unpickled world repeats what was done since the last :meth:`set_state`, so that it also has the contacts
+    that the solver remembers and goes on with the same bits. After 10,000 calls without one it cannot be copied.
 
     The disc is kinematic: it pushes the block, nothing pushes it, and walls do not stop it. Space has no friction and
     a damping that stills the block between two contacts.
@@ -68,6 +70,11 @@ class PushTWorld:
 
     def __getstate__(self) -> dict[str, Any]:
         # A pymunk space copies neither the centre of gravity nor the solver's memory faithfully.
+        if len(self._journal) > MOST_CALLS:
+            raise RuntimeError(
+                f"a PushT scene that was stepped more than {MOST_CALLS} times since its last set_state() cannot be copied: "
+                "reset it first."
+            )
         return {"relative": self.relative, "journal": self._journal}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -93,10 +100,14 @@ class PushTWorld:
         self.space.add(self.agent, pymunk.Circle(self.agent, AGENT_RADIUS))
         self.space.add(self.block, pymunk.Poly(self.block, BAR), pymunk.Poly(self.block, STEM))
 
+    def _note(self, method: str, argument: np.ndarray) -> None:
+        if len(self._journal) <= MOST_CALLS:
+            self._journal.append((method, argument.copy()))
+
     def set_state(self, state: np.ndarray) -> None:
         """Restores a state [7] without a physics step."""
         self._build()
-        self._journal.append(("set_state", state.copy()))
+        self._note("set_state", state)
         self._place(state)
         self._state = state.copy()
 
@@ -105,7 +116,7 @@ class PushTWorld:
 
         The agent is carried on by its velocity, and what overlapped before the restoration pushes the block after it.
         """
-        self._journal.append(("restore_legacy", state.copy()))
+        self._note("restore_legacy", state)
         self._place(state)
         self.space.step(TIME_STEP)
         self._read()
@@ -127,8 +138,8 @@ class PushTWorld:
         Args:
             action: [2] float64, not clipped.
         """
-        action = np.array(action, dtype=np.float64)
-        self._journal.append(("step", action))
+        action = np.asarray(action, dtype=np.float64)
+        self._note("step", action)
         target = action * ACTION_SCALE + self._state[:2] if self.relative else action
         target_x, target_y = float(target[0]), float(target[1])
         agent = self.agent

@@ -11,7 +11,16 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
-from torchrl_ficreg import CausalPredictor, ConvEncoder, FICRegLoss, InverseDynamicsModel, LeWMLoss, SIGReg
+from torchrl_ficreg import (
+    CausalPredictor,
+    ConvEncoder,
+    FICRegLoss,
+    InverseDynamicsModel,
+    LatentWorldModel,
+    LeWMLoss,
+    SIGReg,
+)
+from torchrl_ficreg.modules.pixels import check_finite
 
 
 def values(loss, *args, **kwargs):
@@ -239,6 +248,37 @@ def test_a_wrong_clip_is_refused_and_a_right_one_taken_afterwards(loss, make_cli
         loss(change(make_clip()))
     sum(loss(make_clip()).values()).backward()
     assert all(param.grad is not None for param in loss.parameters())
+
+
+class _OwnEncoder(nn.Module):
+    """One that looks at no value: BatchNorm on the flat frames."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Sequential(nn.Flatten(), nn.BatchNorm1d(768), nn.Linear(768, 6))
+
+    def forward(self, pixels):
+        return self.net(pixels.flatten(0, -4).float()).unflatten(0, pixels.shape[:-3])
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_pixels_that_are_not_finite_are_refused_before_any_statistic_moves(networks, make_clip, value):
+    """By a loss and a world model around any encoder; in a graph that is traced nothing is looked at."""
+    _, predictor, inverse_model = networks()
+    encoder = TensorDictModule(_OwnEncoder(), ["pixels"], ["latent"])
+    loss, clip = FICRegLoss(encoder, predictor, inverse_model, sigreg=SIGReg(4)), make_clip()
+    clip["pixels"] = clip["pixels"] / 255
+    poisoned, before = clip.clone(), {key: value.clone() for key, value in loss.state_dict().items()}
+    poisoned["pixels"][3, 1, 0, 2, 5] = value
+    model = LatentWorldModel(encoder, predictor, frame_skip=2)
+    for door in (loss, model, lambda clip: model.encode(clip["pixels"])):
+        with pytest.raises(ValueError, match=r"pixels \[8, 3, 3, 16, 16\] hold a NaN or an infinity"):
+            door(poisoned)
+        assert all(value.equal(before[key]) for key, value in loss.state_dict().items())
+    sum(loss(clip).values()).backward()
+    assert all(param.grad.isfinite().all() for param in loss.parameters())
+    graph = torch.compile(lambda pixels: check_finite(pixels) or pixels + 1, fullgraph=True, backend="eager")
+    assert not graph(poisoned["pixels"]).isfinite().all()
 
 
 def _poison(clip, value):

@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 
 from torchrl_ficreg.modules.collectives import sum_over_processes
+from torchrl_ficreg.modules.pixels import check_finite
 
 
 class Clip(NamedTuple):
@@ -36,8 +37,9 @@ class Clip(NamedTuple):
 def read_clip(tensordict: TensorDictBase, pixels: NestedKey, action: NestedKey, mask: NestedKey) -> Clip:
     """Reads and checks a clip.
 
-    Values are looked at on the CPU and in eager mode only, where it costs next to nothing. On an accelerator it would
-    hold up the queue, and in a compiled graph break it: there a wholly masked batch gives terms of zero, and actions
+    Floating pixels are looked at in eager mode, on every device: a NaN would stay in the running statistics of BatchNorm.
+    Masks and actions are looked at on the CPU and in eager mode only, where it costs next to nothing. On an accelerator it
+    would hold up the queue, and in a compiled graph break it: there a wholly masked batch gives terms of zero, and actions
     that are not finite give terms that are not.
 
     Args:
@@ -48,7 +50,7 @@ def read_clip(tensordict: TensorDictBase, pixels: NestedKey, action: NestedKey, 
 
     Raises:
         KeyError: a key is missing.
-        ValueError: shapes that do not fit, no transition left by the mask, or actions that are not finite.
+        ValueError: shapes that do not fit, no transition left by the mask, or pixels or actions that are not finite.
     """
     frames, blocks = require(tensordict, pixels), require(tensordict, action)
     if 0 in frames.shape:
@@ -73,6 +75,7 @@ def read_clip(tensordict: TensorDictBase, pixels: NestedKey, action: NestedKey, 
             )
         trusted = trusted[..., :-1]
         blocks = torch.where(trusted.unsqueeze(-1), blocks, 0.0)
+    check_finite(frames)
     if blocks.device.type == "cpu" and not torch.compiler.is_compiling():
         _check_values(blocks, trusted)
     return Clip(frames, blocks, trusted)

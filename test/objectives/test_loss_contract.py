@@ -230,6 +230,7 @@ def test_an_error_inside_leaves_the_networks_usable(networks, make_clip, failing
         (lambda c: c.set("action", c["action"][..., :4]), ValueError, "6 wide .* got 4: check frame_skip"),
         (lambda c: TensorDict({**c, "action": c["action"][:, :2]}, [8]), ValueError, "every frame has an action block"),
         (lambda c: c.set("pixels", c["pixels"].long()), TypeError, "uint8 .* or floating .* got torch.int64"),
+        (lambda c: c.set("action", c["action"].long()), TypeError, "actions must be floating.* got torch.int64"),
         (lambda c: c.set("pixels", c["pixels"][..., :8]), ValueError, r"pixels must be \[..., 3, 16, 16\]"),
         (lambda c: torch.cat([c, c], 1), ValueError, "sees 1 to 2 latents, got 5"),
         (lambda c: c.set("mask", torch.ones(8, 3, 1) > 0), ValueError, r"expected \[8, 3\] bool, got \[8, 3, 1\]"),
@@ -248,6 +249,16 @@ def test_a_wrong_clip_is_refused_and_a_right_one_taken_afterwards(loss, make_cli
         loss(change(make_clip()))
     sum(loss(make_clip()).values()).backward()
     assert all(param.grad is not None for param in loss.parameters())
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_actions_of_another_precision_are_taken_in_that_of_the_networks(loss, make_clip, dtype):
+    """NumPy's default is float64; a float64 network takes float64 actions as they are."""
+    clip = make_clip()
+    clip["action"] = clip["action"].bfloat16().float()  # exact in all of them
+    expected = values(loss.eval(), clip)
+    torch.testing.assert_close(values(loss, clip.clone().set("action", clip["action"].to(dtype))), expected)
+    assert values(loss.double(), clip.set("action", clip["action"].double()))["loss_pred"].dtype == torch.float64
 
 
 class _OwnEncoder(nn.Module):

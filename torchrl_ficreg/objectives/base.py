@@ -107,7 +107,10 @@ class LatentLoss(LossModule):
 
     def _read(self, tensordict: TensorDictBase) -> Clip:
         keys = self.tensor_keys
-        return read_clip(tensordict, keys.pixels, keys.action, keys.mask)
+        clip = read_clip(tensordict, keys.pixels, keys.action, keys.mask)
+        if clip.action.dtype == torch.float32:
+            return clip
+        return clip._replace(action=clip.action.to(next(self.parameters()).dtype))  # as frames are
 
     def _encode(self, pixels: torch.Tensor) -> torch.Tensor:
         """Frames [B, T, 3, H, W] -> latents [B, T, D]."""

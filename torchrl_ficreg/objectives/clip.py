@@ -50,6 +50,7 @@ def read_clip(tensordict: TensorDictBase, pixels: NestedKey, action: NestedKey, 
 
     Raises:
         KeyError: a key is missing.
+        TypeError: actions that are not floating.
         ValueError: shapes that do not fit, no transition left by the mask, or pixels or actions that are not finite.
     """
     frames, blocks = require(tensordict, pixels), require(tensordict, action)
@@ -65,6 +66,8 @@ def read_clip(tensordict: TensorDictBase, pixels: NestedKey, action: NestedKey, 
             f"every frame has an action block: expected action {[*frames.shape[:-3], 'F * A']}, "
             f"got {list(blocks.shape)}."
         )
+    if not blocks.is_floating_point():
+        raise TypeError(f"actions must be floating, z-scored numbers, got {blocks.dtype}: convert them.")
     trusted = tensordict.get(mask, None)
     blocks = blocks[..., :-1, :]
     if trusted is not None:

@@ -48,7 +48,7 @@ wandb/, tensorboard/  files of the logger, where one was asked for
 
 # Settings that change neither the weights nor how they are reached; a finished run may be given others.
 _FREE = ("collect.", "distributed.", "device", "evaluation.", "plan.", "logger.", "resume")
-_FREE += ("optim.checkpoint_activations", "optim.compile")  # which change no number
+_FREE += ("optim.checkpoint_activations",)  # which changes no number; a compiled graph draws other dropout masks
 _FREE += ("env.budget", "env.goal_offset", "env.num_workers", "env.state_unit")
 _PLACES = ("data_dir", "dataset")
 _DAMAGE = (ValueError, TypeError, AttributeError, AssertionError, RecursionError)  # what a damaged config.yaml leads to

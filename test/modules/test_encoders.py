@@ -89,6 +89,35 @@ def test_other_frames_are_refused(encoder, pixels, error, message):
         encoder(pixels=pixels)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda share: share * 255,
+        lambda share: 2 * share - 1,
+        lambda share: (share - 0.45) / 0.225,
+        lambda share: share.index_fill(0, torch.tensor(1), torch.nan),
+        lambda share: share.index_fill(0, torch.tensor(1), torch.inf),
+        lambda share: share.index_fill(0, torch.tensor(1), -torch.inf),
+    ],
+)
+def test_floats_outside_their_range_are_refused_before_any_statistic_moves(build, change, dtype):
+    """0..255, -1..1 and normalised frames, a NaN and infinities; the right floats are taken afterwards."""
+    encoder, share = build(), (frames(4) / 255).to(dtype)
+    state = {key: value.clone() for key, value in encoder.state_dict().items()}
+    with pytest.raises(ValueError, match="floating pixels must lie in 0..1, got .*: divide 0..255 by 255"):
+        encoder(pixels=change(share))
+    assert all(value.equal(state[key]) for key, value in encoder.state_dict().items())
+    assert encoder(pixels=share).isfinite().all()
+
+
+def test_floats_can_be_normalized_under_a_transform_of_torch_func():
+    """Where no value can be looked at, none is."""
+    share, normalize = frames(2, 1) / 255, PixelNormalizer(16)
+    torch.testing.assert_close(torch.func.vmap(normalize)(share).flatten(0, 1), normalize(share))
+    assert torch.func.jacrev(lambda pixels: normalize(pixels).mean((-2, -1)))(share[0]).isfinite().all()
+
+
 def test_sizes_that_do_not_divide_are_refused():
     with pytest.raises(ValueError, match="image_size 18 must be a multiple of 4"):
         ConvEncoder(image_size=18, channels=(4, 8))

@@ -14,10 +14,13 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 from torchrl.objectives import BCLoss
 
 from torchrl_ficreg.data import ActionStatistics, OfflineTrajectories
 from torchrl_ficreg.data.latents import encode_episodes, GoalRows
+from torchrl_ficreg.modules.goal_network import GoalNetwork
 from torchrl_ficreg.modules.goal_policy import GoalPolicy, load_goal_policy, save_goal_policy
 
 
@@ -71,6 +74,26 @@ def test_a_latent_dimension_that_never_changes_is_only_centred(policy):
 def test_training_latents_that_cannot_standardise_are_refused(policy, wrong):
     with pytest.raises(ValueError, match="latents"):
         policy.standardize_by(wrong)
+
+
+class _NoDouble(TorchDispatchMode):
+    """Refuses every operation that makes float64, as Apple's GPU does."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        assert not any(isinstance(one, torch.Tensor) and one.dtype == torch.float64 for one in tree_leaves(made)), func
+        return made
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_its_input_is_standardised_on_a_device_without_float64(dtype):
+    """And as exactly as with it: a mean of 1000 times the spread."""
+    network, latent = GoalNetwork(6, 4, hidden_dim=8, depth=1), (1000 + torch.randn(2000, 6)).to(dtype)
+    with _NoDouble():
+        network.standardize_by(latent)
+    std, mean = torch.std_mean(latent.double(), 0, correction=0)
+    torch.testing.assert_close(network.latent_mean, mean.float())
+    torch.testing.assert_close(network.latent_std, std.float())
 
 
 def test_sizes_and_shapes_that_make_no_sense_are_refused(policy):

@@ -12,7 +12,16 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
-from torchrl_ficreg import CausalPredictor, ConvEncoder, FICRegLoss, InverseDynamicsModel, LeWMLoss, SIGReg
+from torchrl_ficreg import (
+    CausalPredictor,
+    ConvEncoder,
+    FICRegLoss,
+    InverseDynamicsModel,
+    LatentWorldModel,
+    LeWMLoss,
+    SIGReg,
+)
+from torchrl_ficreg.modules.pixels import check_finite
 
 
 def values(loss, *args, **kwargs):
@@ -222,6 +231,7 @@ def test_an_error_inside_leaves_the_networks_usable(networks, make_clip, failing
         (lambda c: c.set("action", c["action"][..., :4]), ValueError, "6 wide .* got 4: check frame_skip"),
         (lambda c: TensorDict({**c, "action": c["action"][:, :2]}, [8]), ValueError, "every frame has an action block"),
         (lambda c: c.set("pixels", c["pixels"].long()), TypeError, "uint8 .* or floating .* got torch.int64"),
+        (lambda c: c.set("action", c["action"].long()), TypeError, "actions must be floating.* got torch.int64"),
         (lambda c: c.set("pixels", c["pixels"][..., :8]), ValueError, r"pixels must be \[..., 3, 16, 16\]"),
         (lambda c: torch.cat([c, c], 1), ValueError, "sees 1 to 2 latents, got 5"),
         (lambda c: c.set("mask", torch.ones(8, 3, 2) > 0), ValueError, r"expected \[8, 3\] bool, got \[8, 3, 2\]"),
@@ -240,6 +250,47 @@ def test_a_wrong_clip_is_refused_and_a_right_one_taken_afterwards(loss, make_cli
         loss(change(make_clip()))
     sum(loss(make_clip()).values()).backward()
     assert all(param.grad is not None for param in loss.parameters())
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_actions_of_another_precision_are_taken_in_that_of_the_networks(loss, make_clip, dtype):
+    """NumPy's default is float64; a float64 network takes float64 actions as they are."""
+    clip = make_clip()
+    clip["action"] = clip["action"].bfloat16().float()  # exact in all of them
+    expected = values(loss.eval(), clip)
+    torch.testing.assert_close(values(loss, clip.clone().set("action", clip["action"].to(dtype))), expected)
+    assert values(loss.double(), clip.set("action", clip["action"].double()))["loss_pred"].dtype == torch.float64
+
+
+class _OwnEncoder(nn.Module):
+    """One that looks at no value: BatchNorm on the flat frames."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Sequential(nn.Flatten(), nn.BatchNorm1d(768), nn.Linear(768, 6))
+
+    def forward(self, pixels):
+        return self.net(pixels.flatten(0, -4).float()).unflatten(0, pixels.shape[:-3])
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_pixels_that_are_not_finite_are_refused_before_any_statistic_moves(networks, make_clip, value):
+    """By a loss and a world model around any encoder; in a graph that is traced nothing is looked at."""
+    _, predictor, inverse_model = networks()
+    encoder = TensorDictModule(_OwnEncoder(), ["pixels"], ["latent"])
+    loss, clip = FICRegLoss(encoder, predictor, inverse_model, sigreg=SIGReg(4)), make_clip()
+    clip["pixels"] = clip["pixels"] / 255
+    poisoned, before = clip.clone(), {key: value.clone() for key, value in loss.state_dict().items()}
+    poisoned["pixels"][3, 1, 0, 2, 5] = value
+    model = LatentWorldModel(encoder, predictor, frame_skip=2)
+    for door in (loss, model, lambda clip: model.encode(clip["pixels"])):
+        with pytest.raises(ValueError, match=r"pixels \[8, 3, 3, 16, 16\] hold a NaN or an infinity"):
+            door(poisoned)
+        assert all(value.equal(before[key]) for key, value in loss.state_dict().items())
+    sum(loss(clip).values()).backward()
+    assert all(param.grad.isfinite().all() for param in loss.parameters())
+    graph = torch.compile(lambda pixels: check_finite(pixels) or pixels + 1, fullgraph=True, backend="eager")
+    assert not graph(poisoned["pixels"]).isfinite().all()
 
 
 def _poison(clip, value):

@@ -136,6 +136,13 @@ def test_another_configuration_under_the_same_name_is_refused(trained, execute, 
     assert files(trained) == before
 
 
+@pytest.mark.parametrize(("setting", "free"), [("checkpoint_activations", True), ("compile", False), ("lr", False)])
+def test_only_what_changes_no_number_may_change_while_a_run_goes_on(scripts, setting, free):
+    """A compiled graph draws other dropout masks."""
+    ours, theirs = ({"optim": {setting: value}} for value in (True, False))
+    assert (scripts("run_dir")._differences(ours, theirs) == "") == free
+
+
 def test_a_name_is_not_lost_to_a_configuration_that_never_trained(trained, execute, tmp_path):
     """A batch larger than the data is found only after the run folder was made; the mended command may use the name."""
     (tmp_path / "data").symlink_to(trained / "data")

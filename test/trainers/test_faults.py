@@ -14,6 +14,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from contextlib import contextmanager, suppress
 
@@ -24,6 +25,7 @@ from tiny import make_trainer, record, run_until_told, same, weights
 from torchrl import torchrl_logger
 from torchrl.checkpoint import Checkpoint
 from torchrl.record.loggers import get_logger
+from torchrl.trainers import Trainer
 
 from torchrl_ficreg.data import EpisodeWriter, OfflineTrajectories
 from torchrl_ficreg.trainers import (
@@ -34,6 +36,7 @@ from torchrl_ficreg.trainers import (
     ReadError,
     stop_on_signal,
     SuccessRate,
+    TolerantLogger,
 )
 
 
@@ -213,57 +216,139 @@ def test_after_a_nan_the_last_checkpoint_continues_as_if_nothing_had_happened(tm
 
 
 def test_a_logger_that_fails_in_the_middle_is_given_up_with_one_warning(tmp_path, unbroken, warnings):
-    """Its files may not grow any more. The run ends as it would have, and its checkpoints know nothing of the logger."""
+    """Its disk is full. The run ends as it would have, and its checkpoints know nothing of the logger."""
     logger = get_logger("csv", logger_name=str(tmp_path / "log"), experiment_name="run")
     trainer = make_trainer(tmp_path / "run", logger=logger, log_interval=1)
-    limit, log_scalar = resource.getrlimit(resource.RLIMIT_FSIZE)[0], logger.log_scalar
 
-    def full_disk(*args, **kwargs):
-        with no_file_may_exceed(1 if trainer.step >= 5 else limit):
-            log_scalar(*args, **kwargs)
+    def fill_disk() -> None:
+        trainer.logger.flush()
+        for name, file in logger.experiment.files.items():
+            file.close()
+            logger.experiment.files[name] = open("/dev/full", "w")
 
-    logger.log_scalar = full_disk
+    at_step(trainer, 5, fill_disk)
     trainer.train()
     assert same(weights(trainer), unbroken)
-    assert len(warnings) == 1 and "CSVLogger is lost (OSError" in warnings[0]
+    assert len(warnings) == 1 and "CSVLogger is lost (OSError: [Errno 28]" in warnings[0]
     assert steps(tmp_path / "run") == [*range(1, 28)]
     assert "logger" not in Checkpoint.manifest(trainer.checkpoint_rotation.latest())["components"]
     assert make_trainer(tmp_path / "run").resume(), "without a logger, too"
+    for file in logger.experiment.files.values():
+        with suppress(OSError):
+            file.close()
+
+
+class Recorder:
+    """A logger that takes a lock for every call, which whoever holds it hangs."""
+
+    def __init__(self) -> None:
+        self.free, self.seen = threading.Lock(), []
+
+    def log_scalar(self, name, value, step=None) -> str:
+        with self.free:
+            self.seen.append((name, value, step))
+        return "seen"
+
+
+def test_a_logger_that_hangs_holds_nothing_up_and_is_told_once(unbroken, warnings):
+    """Neither the training, with more calls than may wait, nor its end."""
+    backend = Recorder()
+    logger = TolerantLogger(backend, timeout=0.5, max_calls=4)
+    trainer = make_trainer(logger=logger, log_interval=1)
+    at_step(trainer, 5, lambda: logger.flush() or backend.free.acquire())
+    began = time.monotonic()
+    trainer.train()
+    logger.flush()
+    assert time.monotonic() - began < 30 and logger.lost
+    assert same(weights(trainer), unbroken)
+    assert warnings == ["Recorder is lost (no answer within 0.5 s): the run goes on without it."]
+    backend.free.release()
+    seen = len(backend.seen)
+    logger.log_scalar("late", 1.0)
+    assert len(backend.seen) <= seen + 1  # the call that hung was made, no other
+
+
+@pytest.mark.parametrize("way", ["flush", "full"])
+def test_a_hang_is_noticed_where_it_is_waited_for(warnings, way):
+    backend = Recorder()
+    logger = TolerantLogger(backend, timeout=0.2, max_calls=2)
+    with backend.free:
+        for step in range(2 if way == "flush" else 6):
+            logger.log_scalar("loss", 0.0, step)
+        if way == "flush":
+            logger.flush()
+        assert logger.lost and len(warnings) == 1
+
+
+def test_a_logger_gets_every_call_in_order_with_the_numbers_of_its_time():
+    """A tensor may be overwritten meanwhile; a function may call the logger itself, and gets what that returns."""
+    backend, value = Recorder(), torch.zeros(1)
+    logger, answers = TolerantLogger(backend), []
+    with backend.free:
+        for step in range(20):
+            logger.log_scalar("loss", value.fill_(step), step)
+        logger.attempt(lambda log: answers.append(log.log_scalar("last", 0.0)), logger)
+    logger.flush()
+    assert [(float(number), step) for _, number, step in backend.seen] == [*((s, s) for s in range(20)), (0.0, None)]
+    assert answers == ["seen"] and not logger.lost
 
 
 WANDB = """
-import os, signal, subprocess
+import importlib.util, os, signal, sys
 from pathlib import Path
 from tiny import make_trainer, weights
 import torch
 from torchrl.record.loggers import get_logger
+from torchrl_ficreg.trainers import TolerantLogger
 
-here = Path.cwd()
+here, number = Path.cwd(), signal.Signals[sys.argv[1]]
 logger = get_logger("wandb", logger_name=str(here), experiment_name="run", wandb_kwargs={"mode": "offline"})
-trainer = make_trainer(logger=logger, log_interval=1)
+tolerant = TolerantLogger(logger, timeout=2)
+trainer = make_trainer(logger=tolerant, log_interval=1)
 tasks = Path(f"/proc/{os.getpid()}/task").glob("*/children")
 children = [int(pid) for file in tasks for pid in file.read_text().split()]
 service = [pid for pid in children if b"wandb" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 assert service
-trainer.register_op("post_steps", lambda: trainer.step == 5 and os.kill(service[0], signal.SIGKILL))
+trainer.register_op("post_steps", lambda: trainer.step == 5 and os.kill(service[0], number))
+(here / "service").write_text(str(service[0]))
 trainer.train()
+for name in ("sklearn", "torchvision", "transformers"):  # wandb would report them to its service
+    if importlib.util.find_spec(name):
+        importlib.import_module(name)
+tolerant.shutdown()  # waits for the service
 assert trainer.logger.lost
 torch.save(weights(trainer), here / "weights.pt")
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for the service below /proc")
-def test_a_run_outlives_the_service_of_wandb(tmp_path, unbroken):
-    """Killed in the middle, in a process of its own, where it can disturb nobody else."""
+@pytest.mark.parametrize("number", ["SIGKILL", "SIGSTOP"])
+def test_a_run_outlives_the_service_of_wandb(tmp_path, unbroken, number):
+    """Killed or stopped in the middle, in a process of its own, where it can disturb nobody else; the process exits."""
     pytest.importorskip("wandb")
     paths = os.pathsep.join([os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")])
     env = {**os.environ, "PYTHONPATH": paths, "WANDB_MODE": "offline", "WANDB_X_SERVICE_WAIT": "120"}
-    done = subprocess.run(
-        [sys.executable, "-c", WANDB], cwd=tmp_path, env=env, capture_output=True, text=True, timeout=240
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.count("WandbLogger is lost") + done.stdout.count("WandbLogger is lost") == 1
+    try:
+        with open(tmp_path / "said", "w") as said:  # not a pipe, which the service would hold open
+            line = [sys.executable, "-c", WANDB, number]
+            done = subprocess.run(line, cwd=tmp_path, env=env, stdout=said, stderr=subprocess.STDOUT, timeout=120)
+    finally:
+        with suppress(OSError, ValueError):
+            os.kill(int((tmp_path / "service").read_text()), signal.SIGKILL)
+    said = (tmp_path / "said").read_text()
+    assert done.returncode == 0, said
+    assert said.count("WandbLogger is lost") == 1
     assert same(torch.load(tmp_path / "weights.pt"), unbroken)
+
+
+@pytest.mark.parametrize(("error", "full"), [(OSError(28, "No space left on device"), True), (ConnectionError("lost"), False)])
+def test_only_a_full_disk_is_told_as_one(tmp_path, monkeypatch, error, full):
+    """Whatever else keeps a checkpoint from being written is told in its own words."""
+    trainer = make_trainer(tmp_path)
+    monkeypatch.setattr(Trainer, "_save_trainer", lambda self: (_ for _ in ()).throw(error))
+    with pytest.raises(OSError, match="step 9 cannot be written .*the same command continues") as caught:
+        trainer.train()
+    assert ("make room" in str(caught.value)) == full
 
 
 def test_sigterm_stops_after_the_step_in_progress_and_the_repeated_command_changes_no_bit(tmp_path, unbroken):

@@ -88,7 +88,7 @@ def test_a_checkpoint_knows_whether_it_was_done():
 
 def test_a_loss_that_stops_being_finite_is_named(networks, clips):
     frozen = on_frozen_latents(networks[0])
-    clips.latent = torch.full_like(clips.latent, np.nan)
+    next(frozen.predictor.parameters()).data.fill_(np.nan)
     loss = LeWMLoss(frozen.encoder, frozen.predictor, sigreg=NoRegularizer())
     with pytest.raises(FloatingPointError, match="refinement step 0: not finite"):
         Refinement(2, batch_size=8, precision="fp32").run(loss, clips, progress_bar=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -64,8 +65,12 @@ class GoalNetwork(nn.Module):
         """
         if latent.ndim != 2 or len(latent) < 2 or latent.shape[1] != self.latent_dim:
             raise ValueError(f"expected at least 2 latents [N, {self.latent_dim}], got {list(latent.shape)}.")
-        std, mean = torch.std_mean(latent.double(), dim=0, correction=0)  # [D], [D]
-        if not (std.isfinite().all() and mean.isfinite().all()):
+        rows = latent if latent.dtype in (torch.float32, torch.float64) else latent.float()
+        rows = rows.cpu().numpy().astype(np.float64)  # summed in float64 by NumPy: MPS has none
+        with np.errstate(invalid="ignore"):  # told below
+            mean, std = rows.mean(0), rows.std(0)  # [D], [D]
+        if not np.isfinite([mean, std]).all():
             raise ValueError("the training latents hold a NaN or an infinity: leave those rows out.")
-        self.latent_mean.copy_(mean)
-        self.latent_std.copy_(torch.where(std < _SMALLEST_STD, torch.ones_like(std), std))
+        std[std < _SMALLEST_STD] = 1
+        for buffer, value in ((self.latent_mean, mean), (self.latent_std, std)):
+            buffer.copy_(torch.tensor(value.tolist(), dtype=buffer.dtype))

@@ -2,12 +2,39 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import nn
 from torch._C._functorch import is_functorch_wrapped_tensor
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+_ROUNDING = 1e-3  # how far half precision or an interpolation may take a pixel out of 0..1
+
+
+def check_finite(pixels: torch.Tensor) -> None:
+    """Refuses floating pixels with a NaN or an infinity, which BatchNorm would keep in its running statistics for good.
+
+    Raises:
+        ValueError: there is one.
+    """
+    extremes = _extremes(pixels)
+    if extremes is not None and not all(map(math.isfinite, extremes)):
+        raise ValueError(f"pixels {list(pixels.shape)} hold a NaN or an infinity: drop those frames, or keep them as uint8.")
+
+
+def _extremes(pixels: torch.Tensor) -> tuple[float, float] | None:
+    """Smallest and largest value, NaN where there is one. None for integers, and where no value can be looked at.
+
+    That is while a graph is traced, captured or mapped over a dimension.
+    """
+    if torch.compiler.is_compiling() or not pixels.is_floating_point() or not pixels.numel() or pixels.is_meta:
+        return None
+    if torch._C._functorch.is_batchedtensor(pixels) or pixels.is_cuda and torch.cuda.is_current_stream_capturing():
+        return None
+    low, high = torch.stack(pixels.detach().aminmax()).tolist()  # one transfer from an accelerator
+    return low, high
 
 
 class PixelNormalizer(nn.Module):
@@ -18,7 +45,7 @@ class PixelNormalizer(nn.Module):
 
     Raises:
         TypeError: pixels are neither uint8 (0..255) nor floating (0..1).
-        ValueError: pixels have another shape.
+        ValueError: pixels have another shape, or floating ones a value outside 0..1.
     """
 
     def __init__(self, image_size: int) -> None:
@@ -42,6 +69,12 @@ class PixelNormalizer(nn.Module):
         if pixels.dtype == torch.uint8:
             return frames.to(self.scale.dtype).mul_(self.scale / 255).add_(self.shift)  # a copy, free to be overwritten
         if pixels.is_floating_point():
+            extremes = _extremes(pixels)
+            if extremes is not None and not -_ROUNDING <= extremes[0] <= extremes[1] <= 1 + _ROUNDING:  # so is a NaN
+                raise ValueError(
+                    f"floating pixels must lie in 0..1, got {extremes[0]:.4g} to {extremes[1]:.4g}: divide 0..255 by 255 or "
+                    "convert it to uint8, undo a normalisation (the encoder has its own), and drop frames with a NaN."
+                )
             return frames.to(self.scale.dtype) * self.scale + self.shift
         raise TypeError(f"pixels must be uint8 (0..255) or floating (0..1), got {pixels.dtype}: convert them.")
 

@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl_ficreg.data.schema import ACTION, LATENT, PIXELS, PREDICTED_LATENT
 from torchrl_ficreg.data.statistics import ActionStatistics
 from torchrl_ficreg.modules.feed import arrange, choose_output, feed, Names, read_output
+from torchrl_ficreg.modules.pixels import check_finite
 from torchrl_ficreg.modules.predictor import CausalPredictor
 
 
@@ -86,7 +87,12 @@ class LatentWorldModel(TensorDictModuleBase):
         self.action_std.copy_(value.std)
 
     def encode(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Frames [..., 3, H, W], uint8 or floats in 0..1 -> latents [..., D]."""
+        """Frames [..., 3, H, W], uint8 or floats in 0..1 -> latents [..., D].
+
+        Raises:
+            ValueError: floats that are not finite.
+        """
+        check_finite(pixels)
         written = self.encoder(feed("encoder", self.encoder, {PIXELS: pixels}))
         return read_output(self.encoder, written, LATENT, -1)
 

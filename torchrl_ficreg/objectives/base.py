@@ -145,7 +145,9 @@ class LatentLoss(LossModule):
         keys = self.tensor_keys
         clip = read_clip(tensordict, keys.pixels, keys.action, keys.mask, self.num_frames)
         self._check_size(*clip.pixels.shape[:-3])
-        return clip
+        if clip.action.dtype == torch.float32:
+            return clip
+        return clip._replace(action=clip.action.to(next(self.parameters()).dtype))  # as frames are
 
     def _check_size(self, *lead: int) -> None:
         """Whether the batch [..., T] is large enough, told in clips, before a layer tells it in channels."""

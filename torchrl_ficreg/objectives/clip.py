@@ -12,6 +12,7 @@ from torch._C._functorch import is_functorch_wrapped_tensor
 
 from torchrl_ficreg.modules.collectives import sum_over_processes
 from torchrl_ficreg.modules.feed import choose_output
+from torchrl_ficreg.modules.pixels import check_finite
 
 
 class Clip(NamedTuple):
@@ -44,8 +45,9 @@ def read_clip(
 ) -> Clip:
     """Reads and checks a clip.
 
-    Values are looked at on the CPU and in eager mode only, where it costs next to nothing. On an accelerator it would
-    hold up the queue, and in a compiled graph break it: there a wholly masked batch gives terms of zero, and actions
+    Floating pixels are looked at in eager mode, on every device: a NaN would stay in the running statistics of BatchNorm.
+    Masks and actions are looked at on the CPU and in eager mode only, where it costs next to nothing. On an accelerator it
+    would hold up the queue, and in a compiled graph break it: there a wholly masked batch gives terms of zero, and actions
     that are not finite give terms that are not.
 
     Args:
@@ -58,10 +60,12 @@ def read_clip(
 
     Raises:
         KeyError: a key is missing.
-        TypeError: an entry is no tensor.
-        ValueError: shapes that do not fit, no transition left by the mask, or actions that are not finite.
+        TypeError: an entry is no tensor, or actions are not floating.
+        ValueError: shapes that do not fit, no transition left by the mask, or pixels or actions that are not finite.
     """
     frames, blocks = read_frames(tensordict, pixels, num_frames), require(tensordict, action)
+    if not blocks.is_floating_point():
+        raise TypeError(f"actions must be floating, z-scored numbers, got {blocks.dtype}: convert them.")
     trusted = tensordict.get(mask, None)
     lead = frames.shape[:-3]  # [..., T]
     if is_transitions(tensordict, pixels, num_frames):
@@ -84,6 +88,7 @@ def read_clip(
         blocks, trusted = blocks.unsqueeze(-2), trusted if trusted is None else trusted.unsqueeze(-1)
     if trusted is not None:
         blocks = torch.where(trusted.unsqueeze(-1), blocks, 0.0)
+    check_finite(frames)
     if blocks.device.type == "cpu" and not torch.compiler.is_compiling() and not is_functorch_wrapped_tensor(blocks):
         _check_values(blocks, trusted)
     return Clip(frames, blocks, trusted)

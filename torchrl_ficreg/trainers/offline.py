@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from pathlib import Path
@@ -52,7 +53,7 @@ class OfflineTrainer(Trainer):
     a file of the dataset vanishes            warns and goes on (the mapping still holds it); shorter: cannot be read
     no room for a checkpoint                  stops, ``OSError``
     no room for ``metrics.csv``               warns and goes on; rows wait in memory until there is room
-    the logger fails                          warns and goes on without it
+    the logger fails or hangs                 warns and goes on without it
     SIGTERM, inside :class:`stop_on_signal`   writes a checkpoint after the step and exits with code 85; SIGINT: 130
     SIGKILL, a crash, a power cut             continues from the last checkpoint when started again
     the newest checkpoint is damaged          warns and continues from the one before
@@ -237,7 +238,7 @@ class OfflineTrainer(Trainer):
         """Saves, when :meth:`save_trainer` finds that a checkpoint is due.
 
         Raises:
-            OSError: the disk has no room for it. The checkpoints already there stay as they are.
+            OSError: it cannot be written, for want of room say. The checkpoints already there stay as they are.
         """
         with self.parallel.whole(self.optimizer):
             if is_main():
@@ -247,9 +248,10 @@ class OfflineTrainer(Trainer):
                     super()._save_trainer()
                     if self.checkpoint_rotation is not None:
                         self._keep(self.checkpoint_rotation.latest())
-                except (OSError, RuntimeError) as error:  # PyTorch reports a file that cannot grow as a RuntimeError
+                except (OSError, RuntimeError) as error:
+                    advice = "make room; " if _is_full(error) else ""
                     raise OSError(
-                        f"the checkpoint of step {self.step} cannot be written ({error}): make room; the same command "
+                        f"the checkpoint of step {self.step} cannot be written ({error}): {advice}the same command "
                         "continues from the last one."
                     ) from error
             wait_for_all()  # a process that ended meanwhile would have torchrun stop the writer too
@@ -307,7 +309,16 @@ class OfflineTrainer(Trainer):
                     self.save_trainer(force_save=True)
                 raise
             self.clock.stop()
+            if isinstance(self.logger, TolerantLogger):
+                self.logger.flush()
         self.parallel.finished(self.optimizer)
+
+
+def _is_full(error: OSError | RuntimeError) -> bool:
+    """Whether a disk, a quota or the largest size of a file was exceeded; PyTorch's archives tell it in words only."""
+    if isinstance(error, OSError):
+        return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return "writ" in str(error)
 
 
 def _align(optimizer: torch.optim.Optimizer) -> None:

@@ -1,0 +1,122 @@
+"""Values and gradients of the four terms against the published formulas, written out here once more in float64.
+
+With z_t the latent of frame t, p_{t+1} the prediction of the next one from z_1 .. z_t and a_t, h the inverse model and
+sg[...] a constant, for clips of history + 1 = 4 frames, means over the batch, time and components::
+
+    L_pred   = mean |p_{t+1} - z_{t+1}|^2                      no stop-gradient anywhere
+    L_sigreg = mean over t and directions u of B integral_{-3}^{3} |phi_u(s) - exp(-s^2 / 2)|^2 exp(-s^2 / 2) ds
+               phi_u(s) = mean over the batch of exp(i s <u, z_t>), the integral by the trapezoidal rule at 33 knots
+    L_idm    = mean |h(sg[z_t], sg[z_{t+1}]) - a_t|^2          reaches h alone
+    L_cons   = mean |h_sg(sg[z_t], p_{t+1}) - a_t|^2           h_sg: the parameters of h as constants
+               live:     p_{t+1} of L_pred (Algorithm 1)       reaches encoder and predictor
+               detached: p_{t+1} anew, from sg[z_1] .. sg[z_t] reaches the predictor alone (the text of section 2.2)
+
+weighted by 1, lambda, mu and gamma.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from loss_collection import BLOCK, CONFIG, SIZE
+from tensordict import TensorDict
+from torch import nn
+
+from torchrl_ficreg import FICRegLoss, make_world_model, ModelConfig, SIGReg
+
+HISTORY, BATCH, DIRECTIONS = 3, 6, 5
+LAMBDA, MU, GAMMA = 0.25, 0.75, 2.0  # exact in the float32 that a coefficient is kept in
+
+
+@pytest.fixture
+def networks() -> dict[str, nn.Module]:
+    """Tiny ones in float64 without dropout, moved off their start values, where zeroed layers would hide a path."""
+    torch.manual_seed(0)
+    sizes = ModelConfig(**{**vars(CONFIG), "history": HISTORY, "predictor_dropout": 0.0})
+    model, inverse_model = make_world_model(sizes, action_dim=3)
+    networks = {"encoder": model.encoder, "predictor": model.predictor, "inverse_model": inverse_model}
+    for network in networks.values():
+        network.double()
+        for param in network.parameters():
+            param.data.add_(0.1 * torch.randn_like(param))
+    return networks
+
+
+@pytest.fixture
+def clip() -> TensorDict:
+    torch.manual_seed(1)
+    pixels = torch.randint(0, 256, (BATCH, HISTORY + 1, 3, SIZE, SIZE), dtype=torch.uint8)
+    action = torch.randn(BATCH, HISTORY + 1, BLOCK, dtype=torch.float64)
+    return TensorDict({"pixels": pixels, "action": action}, [BATCH, HISTORY + 1])
+
+
+def normality(latent: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+    """L_sigreg of latents [B, T, D] along directions [D, M]."""
+    knots = torch.linspace(-3, 3, 33, dtype=torch.float64)
+    gaussian = (-knots.square() / 2).exp()
+    phase = knots * (latent @ directions).unsqueeze(-1)  # [B, T, M, 33]
+    real, imaginary = phase.cos().mean(0), phase.sin().mean(0)
+    distance = ((real - gaussian).square() + imaginary.square()) * gaussian
+    return len(latent) * torch.trapezoid(distance, knots).mean()
+
+
+def formulas(networks: dict[str, nn.Module], clip: TensorDict, directions: torch.Tensor, context: str) -> dict:
+    """The four weighted terms, as above."""
+    encoder, predictor, inverse = (network.module for network in networks.values())
+    constants = {name: param.detach() for name, param in inverse.named_parameters()}
+    action = clip["action"][:, :HISTORY]
+    latent = encoder(clip["pixels"])
+    before, after = latent[:, :HISTORY], latent[:, 1:]
+    predicted = predictor(before, action)
+    imagined = predicted if context == "live" else predictor(before.detach(), action)
+    told = torch.func.functional_call(inverse, constants, (before.detach(), imagined))
+    return {
+        "loss_pred": (predicted - after).square().mean(),
+        "loss_sigreg": LAMBDA * normality(latent, directions),
+        "loss_idm": MU * (inverse(before.detach(), after.detach()) - action).square().mean(),
+        "loss_consistency": GAMMA * (told - action).square().mean(),
+    }
+
+
+def gradients(term: torch.Tensor, modules: dict[str, nn.Module]) -> dict[str, list[torch.Tensor]]:
+    return {
+        name: torch.autograd.grad(term, list(module.parameters()), retain_graph=True, materialize_grads=True)
+        for name, module in modules.items()
+    }
+
+
+@pytest.mark.parametrize("context", ["live", "detached"])
+def test_values_and_gradients_are_those_of_the_formulas(networks, clip, context):
+    """Of every term for every network, in training, to eight digits and more."""
+    theirs = copy.deepcopy(networks)
+    sigreg = SIGReg(DIRECTIONS)
+    loss = FICRegLoss(
+        *networks.values(), sigreg=sigreg, sigreg_coeff=LAMBDA, idm_coeff=MU, consistency_coeff=GAMMA, context=context
+    ).double()
+    sigreg.eval()
+    directions = sigreg._draw(CONFIG.latent_dim).double()
+    torch.testing.assert_close(directions.norm(dim=0), torch.ones(DIRECTIONS, dtype=torch.float64), rtol=1e-6, atol=0)
+    output, expected = loss(clip), formulas(theirs, clip, directions, context)
+    assert set(output.keys()) == set(expected)
+    ours = {name: getattr(loss, f"{name}_params") for name in networks}
+    order = {name: [key for key, _ in module.named_parameters()] for name, module in theirs.items()}
+    for term, value in expected.items():
+        assert output[term].dtype == torch.float64
+        torch.testing.assert_close(output[term], value, rtol=1e-9, atol=1e-12)
+        wanted = gradients(value, theirs)
+        for name, params in ours.items():
+            found = dict(params.flatten_keys(".").items())
+            got = torch.autograd.grad(
+                output[term], [found[key] for key in order[name]], retain_graph=True, materialize_grads=True
+            )
+            for key, one, other in zip(order[name], got, wanted[name], strict=True):
+                torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-12, msg=lambda m: f"{term}, {name}.{key}: {m}")  # noqa: B023
+    reached = {
+        (term, name): any(gradient.abs().sum() > 0 for gradient in gradients(value, theirs)[name])
+        for term, value in expected.items()
+        for name in theirs
+    }
+    assert reached["loss_consistency", "encoder"] == (context == "live")
+    assert not any(reached[term, "inverse_model"] for term in expected if term != "loss_idm")

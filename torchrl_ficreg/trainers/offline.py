@@ -17,7 +17,7 @@ from torchrl.trainers.trainers import LRSchedulerHook
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.modules.memory import keep_freed_memory
 from torchrl_ficreg.modules.precision import Precision
-from torchrl_ficreg.trainers.checkpoint import check_members, check_room, CHECKPOINTS, DAMAGES, latest_whole
+from torchrl_ficreg.trainers.checkpoint import check_members, check_room, CHECKPOINTS, DAMAGES, latest_whole, set_odd_aside
 from torchrl_ficreg.trainers.clock import Clock
 from torchrl_ficreg.trainers.distributed import from_main, is_main, rank, wait_for_all, world_size
 from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
@@ -202,7 +202,11 @@ class OfflineTrainer(Trainer):
             FileNotFoundError: the run is past ``keep_epoch``, and that epoch's checkpoint was not kept.
             ValueError: the checkpoint is damaged, or belongs to other networks, data or hooks.
         """
-        latest = None if self.checkpoint_rotation is None else latest_whole(self.checkpoint_rotation)
+        rotation, latest = self.checkpoint_rotation, None
+        if rotation is not None:
+            latest = latest_whole(rotation)
+            if is_main():
+                set_odd_aside(rotation)
         latest = from_main(start if latest is None else latest)
         if latest is not None:
             check_members(latest)
@@ -280,7 +284,7 @@ class OfflineTrainer(Trainer):
             return
         for pattern in (".*.stage-*", ".*.archive-*", ".*.delete-*"):
             for left in self.checkpoint_rotation.directory.glob(pattern):
-                shutil.rmtree(left) if left.is_dir() else left.unlink()
+                shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
 
     def train(self) -> None:
         """Runs to the end, or not at all when the resumed run had reached it.

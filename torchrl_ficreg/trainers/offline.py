@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections import defaultdict, deque
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,7 @@ from torchrl_ficreg.trainers.stream import ReadError, ReplayStream
 from torchrl_ficreg.trainers.tolerant import TolerantLogger
 
 METRICS = "metrics.csv"
+_KEPT = 100  # latest numbers of each kind in memory, for hooks such as TorchRL's EarlyStopping; all are in metrics.csv
 
 
 class OfflineTrainer(Trainer):
@@ -165,6 +168,7 @@ class OfflineTrainer(Trainer):
             ),
             checkpoint_rotation=rotation,
         )
+        self._log_dict = defaultdict(partial(deque, maxlen=_KEPT))
         self._checkpoint_skip_warnings.add("logger")  # it has no state, on purpose
         self.logger = TolerantLogger.around(logger) if is_main() else None
         self.schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, WarmupCosine(self.schedule_steps, warmup))

@@ -7,6 +7,7 @@ import os
 import pickle
 import random
 import shutil
+import tempfile
 import zipfile
 from dataclasses import asdict
 from pathlib import Path
@@ -598,3 +599,23 @@ def test_the_sweep_removes_a_link_and_not_what_it_leads_to(finished, tmp_path):
     (link := tmp_path / "run" / "checkpoints" / ".checkpoint-1.stage-1").symlink_to(thesis)
     assert make_trainer(tmp_path / "run").resume()
     assert not link.is_symlink() and (thesis / "text").read_text() == "long"
+
+
+def test_what_a_killed_loader_unpacked_is_removed_a_day_later(finished, tmp_path, monkeypatch):
+    """Neither what is newer, which a loader at work may read, nor what a link leads to."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    old, new, link = (tmp_path / f"torchrl-checkpoint-load-{name}" for name in ("old", "new", "link"))
+    (aim := tmp_path / "aim").mkdir()
+    old.mkdir(), new.mkdir(), link.symlink_to(aim)
+    (old / "file").write_text("")
+    for path in (old, aim):
+        os.utime(path, (0, 0))
+    load_world_model(finished[0])
+    assert {path.name for path in tmp_path.iterdir()} == {new.name, link.name, "aim"}
+
+
+def test_a_full_folder_of_temporary_files_is_named(finished, tmp_path, monkeypatch):
+    path = find_checkpoint(finished[0])
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    with pytest.raises(OSError, match=f"{path.name} cannot be unpacked in .*gone .*set TMPDIR"):
+        load_world_model(path)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import shutil
+import stat
 import tempfile
+import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -33,6 +36,7 @@ _MEMBERS = re.compile(r"manifest\.json|components/[\w.%-]+/(value\.json|state\.j
 _FOLDER = {"shape": [], "_type": "<class 'tensordict._td.TensorDict'>"}  # what meta.json notes beside tensors
 _PLACE = re.compile(r"components/[\w.%-]+")  # of one component
 _MANIFEST = "manifest.json"
+_UNPACKED_SECONDS = 24 * 3600.0  # no loader takes as long
 _MOST_UNPACKED = 16  # times the size of an archive: what trained weights and moments never shrink by
 # What reading a damaged or foreign checkpoint raises.
 DAMAGES = (CheckpointError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError)
@@ -397,6 +401,18 @@ class _State:
         self.state = state_dict
 
 
+def sweep_unpacked() -> None:
+    """Removes archives that loaders of this user unpacked a day ago and, killed, left in the folder of temporary files."""
+    for left in Path(tempfile.gettempdir()).glob("torchrl-checkpoint-load-*"):
+        try:
+            found = left.lstat()
+            mine = not hasattr(os, "getuid") or found.st_uid == os.getuid()
+            if mine and stat.S_ISDIR(found.st_mode) and found.st_mtime < time.time() - _UNPACKED_SECONDS:
+                shutil.rmtree(left, ignore_errors=True)
+        except OSError:  # another process removed it
+            continue
+
+
 def _load(parts: dict[str, Any], path: Path) -> dict[str, Any]:
     """Reads components of a checkpoint, on the CPU; their values.
 
@@ -404,6 +420,7 @@ def _load(parts: dict[str, Any], path: Path) -> dict[str, Any]:
         OSError: an archive cannot be unpacked.
         ValueError: a checkpoint of another kind, or a damaged one.
     """
+    sweep_unpacked()
     try:
         return Checkpoint(**parts).load(path, components=list(parts), map_location="cpu").values
     except OSError as error:

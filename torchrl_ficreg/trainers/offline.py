@@ -19,7 +19,15 @@ from torchrl.trainers.trainers import LRSchedulerHook
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.modules.memory import keep_freed_memory
 from torchrl_ficreg.modules.precision import Precision
-from torchrl_ficreg.trainers.checkpoint import check_members, check_room, CHECKPOINTS, DAMAGES, latest_whole, set_odd_aside
+from torchrl_ficreg.trainers.checkpoint import (
+    check_members,
+    check_room,
+    CHECKPOINTS,
+    DAMAGES,
+    latest_whole,
+    set_odd_aside,
+    sweep_unpacked,
+)
 from torchrl_ficreg.trainers.clock import Clock
 from torchrl_ficreg.trainers.distributed import from_main, is_main, rank, wait_for_all, world_size
 from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
@@ -214,6 +222,7 @@ class OfflineTrainer(Trainer):
         latest = from_main(start if latest is None else latest)
         if latest is not None:
             check_members(latest)
+            sweep_unpacked()
             try:
                 checkpoint = Checkpoint() if self.checkpoint is None else self.checkpoint
                 # Every component takes its tensors to its own device; the one they came from may not exist here.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import signal
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from torchrl_ficreg.evaluation import save_episodes_gif, StartGoalPairs
 from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_model
 
 RESULTS = "results.json"
+SHARED = ("checkpoint", "pairs", "budget")  # settings besides the plan
 LARGEST = 10**6  # of a count in a plan, and of a budget: more is a damaged or hostile card, or a slip
 
 
@@ -141,14 +143,31 @@ def read_others(parent: Path, own: str) -> dict[str, dict[str, Any]]:
         if path.parent.name == own:
             continue
         try:
-            results = read_json(path, "results of an evaluation")
-            flatten({**results["plan"], **results["random"]})
-            row_name(results), [float(results["policy"][key]) for key in ("success_rate", "success_rate_at_end")]
-            int(results["policy"]["solved_at_start"]), float(results["policy"]["seconds_per_plan"])
-            found[path.parent.name] = results
-        except (ValueError, TypeError, KeyError, OSError) as error:
-            print(f"left out of the table: {path} ({type(error).__name__}: {error})")
+            found[path.parent.name] = check_results(read_json(path, "results of an evaluation"))
+        except (ValueError, TypeError, KeyError, AttributeError, ArithmeticError, RecursionError, OSError) as error:
+            reason = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+            print(f"left out of the table: {path} ({reason})")
     return found
+
+
+def check_results(results: Any) -> dict[str, Any]:
+    """Results that the table can show.
+
+    Raises:
+        ValueError, TypeError, KeyError, AttributeError, OverflowError: a value is missing, or of another kind.
+    """
+    policy = results["policy"]
+    low, high = policy["success_interval"]
+    unsolved = policy["success_rate_unsolved_at_start"]
+    numbers = [policy[key] for key in ("pairs", "solved_at_start", "success_rate", "success_rate_at_end", "seconds_per_plan")]
+    for number in (*numbers, low, high, 0 if unsolved is None else unsolved):
+        if isinstance(number, bool) or not isinstance(number, (int, float)) or not math.isfinite(number):
+            raise ValueError(f"{str(number)[:40]!r} is no number")
+    [results[key] for key in SHARED]
+    flatten({"plan": {**results["plan"]}})
+    if not row_name(results).isprintable() or len(row_name(results)) > 80:
+        raise ValueError("method and search are no names")
+    return results
 
 
 def row_name(results: dict[str, Any]) -> str:
@@ -158,9 +177,8 @@ def row_name(results: dict[str, Any]) -> str:
 
 def show(evaluations: dict[str, dict[str, Any]]) -> None:
     """Prints a table over evaluations, by the names of their folders; the first is the one just made."""
-    shared = ("checkpoint", "pairs", "budget")
     flat = {
-        name: {**{key: results[key] for key in shared}, **flatten(results["plan"], "plan.")}
+        name: {**{key: results[key] for key in SHARED}, **flatten(results["plan"], "plan.")}
         for name, results in evaluations.items()
     }
     keys = dict.fromkeys(key for settings in flat.values() for key in settings if key != "plan.search")

@@ -20,7 +20,7 @@ from torchrl_ficreg import (
     PathDistance,
     PlanConfig,
 )
-from torchrl_ficreg.modules.goal_policy import load_goal_policy
+from torchrl_ficreg.modules.goal_policy import CONFIG_FILE, load_goal_policy, WEIGHTS_FILE
 from torchrl_ficreg.modules.planners import SEARCHES
 
 POLICY_FOLDER = "goal_policy"  # in a run directory
@@ -111,7 +111,7 @@ def make_policy(
     folder, policy = plan.get("policy"), None
     if folder is not None:
         folder = run_dir / POLICY_FOLDER if folder == "auto" else Path(folder)
-        if not folder.exists():
+        if not any((folder / name).exists() for name in (CONFIG_FILE, WEIGHTS_FILE)):
             raise FileNotFoundError(f"no policy in {folder}: run train_policy.py checkpoint={run_dir} first.")
         policy = load_goal_policy(folder, model, device=model.action_mean.device)
     planner = SEARCHES[plan.search](

@@ -10,11 +10,10 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from torchrl.checkpoint import CheckpointRotation
 from utils import flatten
 
 from torchrl_ficreg._utils import lock_file, MOST_JSON_BYTES, read_bytes, write_atomic
-from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, find_checkpoint, read_card
+from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, checkpoints_in, find_checkpoint, read_card
 from torchrl_ficreg.trainers.offline import METRICS
 
 README = "README.txt"
@@ -131,7 +130,7 @@ def find_start(cfg: DictConfig, run_dir: Path) -> Path | None:
         return None
     start = find_checkpoint(cfg.resume)
     own = run_dir / CHECKPOINTS
-    latest = CheckpointRotation(own, keep_last=1).latest()
+    latest = next(reversed(checkpoints_in(own)), None)
     if latest is not None:
         if start.resolve().parent == own.resolve() and start.name != latest.name:
             raise ValueError(f"{own} holds later checkpoints than {start.name}: move those away, and resume=auto takes it.")

@@ -7,7 +7,6 @@ It goes beside the run's checkpoints, acts without planning, and proposes plans 
 
 from __future__ import annotations
 
-import json
 import signal
 import time
 import warnings
@@ -24,6 +23,7 @@ from tqdm import trange
 from utils import claim_folder, encoder_of, flatten, get_device, settings_of_card, versions, write_json
 
 from torchrl_ficreg import LatentWorldModel
+from torchrl_ficreg._utils import read_json
 from torchrl_ficreg.data.latents import BLOCKS, encode_episodes, GoalRows
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.goal_policy import GoalPolicy, load_goal_policy, save_goal_policy
@@ -54,7 +54,18 @@ def train_beside(cfg: DictConfig) -> None:
         print(f"{folder} holds this policy already: overwrite=true trains it again.")
         report(metrics)
         return
+    before = folder.exists()
     claim_folder(folder, None if cfg.output else folder.parent)
+    try:
+        train_into(cfg, folder, checkpoint, model, card)
+    except BaseException:
+        if not before and not any(folder.iterdir()):
+            folder.rmdir()
+        raise
+
+
+def train_into(cfg: DictConfig, folder: Path, checkpoint: Path, model: LatentWorldModel, card: ModelCard) -> None:
+    """Trains, prints the numbers and writes policy and numbers; a policy already there stays until then."""
     began = time.perf_counter()
     device = get_device(cfg.device)
     train_rows, held_out = make_rows(cfg, model.to(device), card)
@@ -70,8 +81,8 @@ def train_beside(cfg: DictConfig) -> None:
         "versions": versions(),
     }
     report(metrics)  # before anything is written: a full disk shall not cost the numbers
-    (folder / METRICS).unlink(missing_ok=True)  # written last, it says that the folder is whole
     save_goal_policy(policy, folder, model)
+    (folder / METRICS).unlink(missing_ok=True)  # written last, it says that the folder is whole
     write_json(folder / METRICS, metrics)
     print(f"policy and {METRICS} in {folder}")
 
@@ -159,8 +170,13 @@ def read_metrics(cfg: DictConfig, folder: Path, model: LatentWorldModel) -> dict
         ValueError: it was trained with other settings, or for other weights.
     """
     load_goal_policy(folder, model)
-    metrics = json.loads((folder / METRICS).read_text())
-    ours, theirs = flatten(OmegaConf.to_container(cfg)), flatten(metrics["config"])
+    metrics = read_json(folder / METRICS, "numbers of a policy")
+    try:
+        ours, theirs = flatten(OmegaConf.to_container(cfg)), flatten(metrics["config"])
+        [float(r2) for name in ("validation", "train") if (r2 := metrics[name]["r2"]) is not None]
+        [float(r2) for r2 in metrics["validation"]["r2_by_blocks"].values() if r2 is not None]
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{folder / METRICS} is damaged ({error!r:.80}): overwrite=true trains the policy again.") from error
     differ = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key) and key not in _FREE]
     if differ:
         what = ", ".join(f"{key}: {theirs.get(key)} -> {ours.get(key)}" for key in differ[:3])

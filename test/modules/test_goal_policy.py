@@ -8,6 +8,7 @@ episodes. Saved and loaded it is the same to the last bit, and it works with no 
 from __future__ import annotations
 
 import json
+import os
 import math
 
 import numpy as np
@@ -330,3 +331,45 @@ def test_missing_and_damaged_files_are_named(tiny_world, saved, tmp_path):
     config.write_text("{")
     with pytest.raises(ValueError, match="policy.json is not JSON"):
         load_goal_policy(saved, tiny_world())
+
+
+@pytest.mark.parametrize("field", ["latent_dim", "hidden_dim", "depth"])
+@pytest.mark.parametrize("size", [10**7, 10**30, -1, float("nan"), True, "3", [1]])
+def test_sizes_that_the_weights_do_not_have_are_refused_before_anything_is_built(tiny_world, saved, field, size):
+    content = json.loads((saved / "policy.json").read_text())
+    content["sizes"][field] = size
+    (saved / "policy.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="do not belong together") as caught:
+        load_goal_policy(saved, tiny_world())
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("at", range(1, 5))
+def test_a_save_that_fails_at_any_write_leaves_a_whole_policy(tiny_world, saved, at, monkeypatch):
+    before = {path.name: path.read_bytes() for path in saved.iterdir()}
+    replace, calls = os.replace, []
+
+    def failing(source, target):
+        calls.append(target)
+        if len(calls) == at:
+            raise OSError("No space left on device")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", failing)
+    with pytest.raises(OSError):
+        save_goal_policy(GoalPolicy(6, 4, hidden_dim=8, depth=1), saved, tiny_world())
+    monkeypatch.undo()
+    assert load_goal_policy(saved, tiny_world()).sizes["hidden_dim"] == (16 if at < 4 else 8)
+    if at < 4:
+        assert {path.name: path.read_bytes() for path in saved.iterdir()} == before
+
+
+def test_a_policy_with_a_flipped_byte_or_a_nan_is_refused(tiny_world, policy, saved):
+    file = saved / "policy.safetensors"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    with pytest.raises(ValueError, match="another checksum"):
+        load_goal_policy(saved, tiny_world())
+    policy.module.latent_std.zero_()
+    with pytest.raises(ValueError, match="latent_std must be positive"):
+        load_goal_policy(save_goal_policy(policy, saved, tiny_world()), tiny_world())

@@ -7,9 +7,11 @@ were computed once by the published code (``sota-check/make_golden_lewm.py``) fr
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,8 @@ from torchrl_ficreg.modules.pretrained import load_lewm, load_pretrained, save_l
 from torchrl_ficreg.modules.pretrained.sizes import build_world_model, world_model_sizes
 
 GOLDEN = Path(__file__).parent / "golden"
+LEWM = {"encoder": "vit", "image_size": 14, "latent_dim": 8, "predictor_heads": 2, "predictor_dim_head": 4}
+LEWM |= {"predictor_dropout": 0.1, "predictor_attention_dropout": 0.1}
 LOSS_BUFFERS = {"sigreg.t": torch.ones(17), "sigreg.phi": torch.ones(17), "sigreg.weights": torch.ones(17)}
 
 
@@ -442,3 +446,181 @@ def test_without_safetensors_the_extra_is_named(tiny_world, monkeypatch, tmp_pat
     monkeypatch.setitem(sys.modules, "safetensors.torch", None)
     with pytest.raises(ImportError, match=r"pip install 'torchrl_ficreg\[pretrained\]'"):
         save_pretrained(tiny_world(), tmp_path)
+
+
+# Foreign, damaged and half-written files
+
+
+@pytest.fixture
+def at_most(monkeypatch):
+    """Bytes of address space that this process may still take while a file is read."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 2**30, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+@pytest.mark.parametrize("size", [10**6, 10**9, 10**30, -1, 0, 1.5, float("nan"), True, "8", None, [4], {}])
+@pytest.mark.parametrize(
+    ("part", "field"),
+    [
+        ("encoder", "image_size"),
+        ("encoder", "latent_dim"),
+        ("encoder", "projector_dim"),
+        ("predictor", "width"),
+        ("predictor", "depth"),
+        ("predictor", "heads"),
+        ("predictor", "mlp_dim"),
+        ("predictor", "history"),
+        ("predictor", "dropout"),
+        ("inverse_model", "hidden_dim"),
+    ],
+)
+def test_sizes_that_the_weights_do_not_have_take_no_memory(safetensors, tiny_world, part, field, size, tmp_path, at_most):
+    """Compared with the file before anything is built: at most a gigabyte may be taken, and little time."""
+    save_pretrained(tiny_world(), tmp_path, InverseDynamicsModel(6, 4, 16))
+    content = json.loads((tmp_path / "config.json").read_text())
+    if field == "dropout" and size == 0:
+        return  # a rate that is one
+    (content if part == "inverse_model" else content["world_model"])[part][field] = size
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    began = time.monotonic()
+    with pytest.raises(ValueError, match="does not describe a world model|does not fit") as caught:
+        load_pretrained(tmp_path)
+    assert time.monotonic() - began < 5 and "\n" not in str(caught.value) and len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(("part", "field"), [("predictor", "depth"), ("predictor", "heads"), ("encoder", "image_size")])
+@pytest.mark.parametrize("size", [10**6, 10**9, -1])
+def test_sizes_of_a_lewm_config_that_the_weights_do_not_have_take_no_memory(tiny, part, field, size, tmp_path, at_most):
+    config = published_config("tiny")
+    config[part][field] = size
+    path = write(tmp_path, weights("tiny"), config)
+    began = time.monotonic()
+    with pytest.raises(ValueError, match="cannot be read as a LeWM checkpoint") as caught:
+        load_lewm(path)
+    assert time.monotonic() - began < 5 and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("change", ["shared", "repeated", "meta", "integer", "complex", "nan"])
+def test_tensors_of_other_kinds_than_weights_are_refused(tiny, change, tmp_path):
+    tensors = weights("tiny")
+    name = "predictor.pos_embedding"
+    if change == "shared":
+        whole = torch.zeros(10**5)
+        tensors |= {f"extra{i}": whole for i in range(200)}
+    else:
+        tensors[name] = {
+            "repeated": torch.zeros(1).expand(10**4, 10**4),
+            "meta": tensors[name].to("meta"),
+            "integer": tensors[name].int(),
+            "complex": tensors[name].to(torch.complex64),
+            "nan": tensors[name] / 0,
+        }[change]
+    with pytest.raises(ValueError, match="would take|not plain arrays|has dtype|holds a NaN") as caught:
+        load_lewm(write(tmp_path, tensors, published_config("tiny")))
+    assert "\n" not in str(caught.value)
+
+
+def test_every_rate_comes_back(safetensors, tiny_world, tmp_path):
+    """Those of the predictor, of its attention weights and of the inverse model; fine-tuning goes on as it was."""
+    model = tiny_world(predictor_dropout=0.25, predictor_attention_dropout=0.125)
+    judge = InverseDynamicsModel(6, 4, 16, dropout=0.5)
+    loaded, back, _ = load_pretrained(save_pretrained(model, tmp_path / "ours", judge))
+    for one, other in ((model, loaded), (judge, back)):
+        theirs = dict(other.named_modules())
+        for name, layer in one.named_modules():
+            for rate in ("p", "weight_dropout"):
+                assert getattr(layer, rate, None) == getattr(theirs[name], rate, None), name
+    with pytest.raises(ValueError, match="one dropout for .*, this one 0.25 and 0.125"):
+        save_lewm(tiny_world(**{**LEWM, "predictor_dropout": 0.25, "predictor_attention_dropout": 0.125}), tmp_path / "lewm")
+    same = tiny_world(**{**LEWM, "predictor_dropout": 0.25, "predictor_attention_dropout": 0.25})
+    block = load_lewm(save_lewm(same, tmp_path / "lewm"), frame_skip=same.frame_skip).predictor.module.blocks[0]
+    assert (block.attn.weight_dropout, block.attn.dropout.p, block.mlp[2].p) == (0.25, 0.25, 0.25)
+    model.predictor.module.blocks[0].mlp[2].p = 0.5
+    with pytest.raises(ValueError, match=r"blocks.0.mlp.2 has p=0.5, which the saved sizes do not tell"):
+        save_pretrained(model, tmp_path / "ours")
+
+
+@pytest.mark.parametrize("name", ["model.safetensors"])
+def test_a_flipped_byte_anywhere_is_found(safetensors, tiny_world, name, tmp_path):
+    file = save_pretrained(tiny_world(), tmp_path) / name
+    whole = file.read_bytes()
+    for at in range(0, len(whole), max(1, len(whole) // 60)):
+        file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises(ValueError, match=f"{name}|does not fit"):
+            load_pretrained(tmp_path)
+    content = json.loads((tmp_path / "config.json").read_text())
+    del content["weights_sha256"]  # as folders of earlier releases
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    file.write_bytes(whole)
+    load_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("action_std", 0.0), ("action_std", -1.0), ("action_mean", float("nan")), ("action_std", float("inf"))],
+)
+def test_numbers_that_no_trained_network_has_are_refused(safetensors, tiny_world, name, value, tmp_path):
+    model = tiny_world()
+    model.get_buffer(name).fill_(value)
+    save_pretrained(model, tmp_path)
+    with pytest.raises(ValueError, match=f"{name} (holds a NaN|must be positive)"):
+        load_pretrained(tmp_path)
+    worse = tiny_world()
+    with torch.no_grad():
+        next(worse.parameters()).fill_(float("inf"))
+    with pytest.raises(ValueError, match="holds a NaN or an infinity"):
+        load_pretrained(save_pretrained(worse, tmp_path))
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("at", range(1, 5))
+@pytest.mark.parametrize("format_name", ["pretrained", "lewm"])
+def test_a_save_that_fails_or_is_killed_at_any_write_leaves_a_whole_model(
+    safetensors, tiny_world, format_name, at, tmp_path, monkeypatch
+):
+    """The old one or the new one, never a mixture; the next save leaves nothing but its own files."""
+    old = tiny_world(**LEWM)
+    new = tiny_world(**{**LEWM, "predictor_heads": 4, "predictor_dim_head": 2})  # every tensor has the same shape
+    save, load = {
+        "pretrained": (save_pretrained, lambda folder: load_pretrained(folder)[0]),
+        "lewm": (save_lewm, lambda folder: load_lewm(folder, frame_skip=old.frame_skip)),
+    }[format_name]
+    save(old, tmp_path)
+    before, replace, calls = snapshot(tmp_path), os.replace, []
+
+    class Killed(BaseException):
+        pass
+
+    def failing(source, target):
+        calls.append(target)
+        if len(calls) == at:
+            raise OSError(errno.ENOSPC, "No space left on device") if at < 4 else Killed
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", failing)
+    with pytest.raises((OSError, Killed)):
+        save(new, tmp_path)
+    monkeypatch.undo()
+    heads = {model.predictor.module.blocks[0].attn.heads: name for model, name in ((old, "old"), (new, "new"))}
+    found = heads[load(tmp_path).predictor.module.blocks[0].attn.heads]
+    assert found == ("old" if at < 4 else "new")
+    if at < 4:
+        assert snapshot(tmp_path) == before
+    save(old, tmp_path)
+    assert snapshot(tmp_path) == before
+
+
+@pytest.mark.parametrize("card", [None, [], "two_room"])
+def test_a_card_that_is_no_object_is_refused(safetensors, tiny_world, card, tmp_path):
+    save_pretrained(tiny_world(), tmp_path)
+    content = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps({**content, "card": card}))
+    with pytest.raises(ValueError, match="card must be a JSON object"):
+        load_pretrained(tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import re
 import shutil
 import sys
@@ -83,8 +84,9 @@ def test_every_cost_can_be_named(trained, evaluate):
 
 
 def test_a_policy_plans_and_proposes(trained, modules, evaluate, tmp_path):
-    """Where there is none, one line says how to get one."""
+    """Where there is none, or an empty folder, one line says how to get one."""
     folder = Path(shutil.copytree(trained, tmp_path / "copy"))
+    (folder / RUN / "goal_policy").mkdir()
     with pytest.raises(SystemExit) as caught:
         evaluate(folder, "plan=policy")
     message = str(caught.value)
@@ -144,3 +146,23 @@ def test_terms_without_weight_are_not_computed(modules):
     cost = planning.make_cost(plan, judge.train())
     assert [type(term).__name__ for term in cost.terms] == ["PathDistance", "InverseConsistency"]
     assert cost.weights == (1.0, 0.2) and not judge.training
+
+
+def test_results_of_others_that_cannot_be_shown_are_left_out_of_the_table(trained, modules, evaluate, tmp_path, capsys):
+    """Whatever is found in their place, the evaluation at hand is shown and written."""
+    whole = evaluate(trained, "plan=cem", "plan.iterations=1")
+    out = tmp_path / "out"
+    wrong = [[], None, 3, {}, {**whole, "plan": []}, {**whole, "policy": None}, {**whole, "method": "a\nb"}, {**whole, "pairs": 1}]
+    wrong[-1].pop("budget")
+    wrong += [{**whole, "policy": {**whole["policy"], key: None}} for key in ("success_interval", "success_rate", "pairs")]
+    texts = [json.dumps(results) for results in wrong] + ["", "{", "[" * 10**5, '{"policy": ' * 500 + "1" + "}" * 500, "1e999"]
+    for number, text in enumerate(texts):
+        (out / f"odd{number}").mkdir()
+        (out / f"odd{number}" / "results.json").write_text(text)
+    (out / "fifo").mkdir()
+    os.mkfifo(out / "fifo" / "results.json")
+    found = modules("evaluate").read_others(out, "mine")
+    lines = capsys.readouterr().out.splitlines()
+    assert list(found.values()) == [whole]
+    assert len([line for line in lines if line.startswith("left out of the table")]) == len(texts) + 1
+    modules("evaluate").show({"mine": whole, **found})

@@ -104,3 +104,16 @@ def test_a_mistake_is_one_line_and_writes_nothing(trained, script, files, overri
     assert re.match("error: .*" + message, caught.value.code) and "\n" not in caught.value.code
     assert not capsys.readouterr().out
     assert files(trained) == before
+    assert not (trained / RUN / "goal_policy").exists()
+
+
+@pytest.mark.parametrize("content", ["[]", "{", "{}", '{"config": []}', '{"config": {}, "train": 3}'])
+def test_damaged_numbers_of_a_policy_are_one_line(once, script, content):
+    folder, _, _ = once
+    path = folder / RUN / "goal_policy" / "metrics.json"
+    before = path.read_text()
+    path.write_text(content)
+    with pytest.raises(SystemExit, match="metrics.json (is damaged|is no readable)") as caught:
+        script(folder, f"checkpoint={RUN}", *SMALL)
+    assert "\n" not in str(caught.value)
+    path.write_text(before)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import random
 import shutil
+import tempfile
 import zipfile
 from dataclasses import asdict
 from pathlib import Path
@@ -16,11 +18,12 @@ import torch
 from tensordict import TensorDict
 from tiny import HIGH, LOW, make_data, make_trainer, record, same, SIZES, weights
 from torchrl import torchrl_logger
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.checkpoint import Checkpoint, CheckpointAdapter, CheckpointRotation, GlobalRNGState
 from torchrl.data import ListStorage, ReplayBuffer
 
 from torchrl_ficreg import LatentCEMPlanner, make_world_model, ModelConfig, MPCPolicy, PlanConfig
 from torchrl_ficreg.data import OfflineTrajectories
+from torchrl_ficreg.modules.pretrained import save_pretrained
 from torchrl_ficreg.trainers import checkpoint_components, find_checkpoint, load_world_model, ModelCard
 from torchrl_ficreg.trainers.checkpoint import latest_whole
 from torchrl_ficreg.trainers.rng import RandomState
@@ -387,3 +390,232 @@ def test_a_tensor_file_that_was_cut_is_refused_and_stays_as_it_is(tmp_path):
         with pytest.raises(ValueError, match=f"{victim.name} has {len(rest)} bytes, expected {len(content)}"):
             load_world_model(path)
         assert victim.read_bytes() == rest
+
+
+def repack(path: Path, edit=None, **settings) -> None:
+    """The archive again, members changed by ``edit(name, content)`` (None leaves one out), written with other settings."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", **settings) as archive:
+        for name, content in members.items():
+            content = content if edit is None else edit(name, content)
+            if content is not None:
+                archive.writestr(name, content)
+
+
+def with_manifest(content: bytes):
+    return lambda path: repack(path, lambda name, old: content if name == "manifest.json" else old)
+
+
+def pack_with(**settings):
+    return lambda path: repack(path, **settings)
+
+
+def encrypt(path: Path) -> None:
+    """Sets the flag of encryption of every member, in both of its headers."""
+    data = bytearray(path.read_bytes())
+    for mark, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        place = data.find(mark)
+        while place >= 0:
+            data[place + at] |= 1
+            place = data.find(mark, place + 4)
+    path.write_bytes(data)
+
+
+def as_fifo(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def bomb(path: Path) -> None:
+    repack(path, lambda name, old: bytes(2**25) if name == "manifest.json" else old, compression=zipfile.ZIP_DEFLATED)
+
+
+def twice(path: Path) -> None:
+    """One tensor is named over and over: loaded, each name is a copy."""
+
+    def edit(name, content):
+        if not name.endswith("world_model/state.json"):
+            return content
+        state = json.loads(content)
+        state["items"] += [[{"kind": "value", "value": f"more{i}"}, state["items"][0][1]] for i in range(3)]
+        return json.dumps(state)
+
+    repack(path, edit)
+
+
+def as_link(path: Path) -> None:
+    path.rename(path.with_name("elsewhere"))
+    path.symlink_to("nowhere")
+
+
+ODD = {
+    "manifest is a list": with_manifest(b"[]"),
+    "manifest is null": with_manifest(b"null"),
+    "manifest is text": with_manifest(b"\xff\xfe{"),
+    "manifest is deep": with_manifest(b"[" * 10**5),
+    "metadata is a list": with_manifest(b'{"format": "torchrl.checkpoint", "format_version": 1, "metadata": []}'),
+    "bzip2": pack_with(compression=zipfile.ZIP_BZIP2),
+    "encrypted": encrypt,
+    "fifo": as_fifo,
+    "bomb": bomb,
+    "twice": twice,
+    "dangling link": as_link,
+}
+
+
+@pytest.mark.parametrize("how", ODD)
+def test_what_is_no_checkpoint_is_refused_in_one_line_and_a_run_goes_on_from_the_one_before(finished, tmp_path, said, how):
+    """Named itself; as the newest of a run directory, from which a model is loaded; when the run is continued."""
+    shutil.copytree(finished[0], tmp_path / "run")
+    earlier, latest = sorted((tmp_path / "run" / "checkpoints").iterdir())
+    ODD[how](latest)
+    (tmp_path / "run" / "checkpoints" / "elsewhere").unlink(missing_ok=True)
+    with pytest.raises((ValueError, FileNotFoundError)) as caught:
+        load_world_model(latest)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+    assert find_checkpoint(tmp_path / "run") == earlier
+    load_world_model(tmp_path / "run")
+    assert f"{latest} is damaged: continuing from {earlier}." in said
+    again = make_trainer(tmp_path / "run")
+    assert again.resume() and again.step == 18
+    again.train()
+    assert find_checkpoint(tmp_path / "run").name == latest.name
+
+
+@pytest.mark.parametrize("what", ["pickle", "cut", "fifo", "link"])
+def test_a_damaged_folder_is_passed_over_as_a_damaged_archive_is(finished, tmp_path, said, what):
+    shutil.copytree(finished[0], tmp_path / "run")
+    earlier, latest = sorted((tmp_path / "run" / "checkpoints").iterdir())
+    with zipfile.ZipFile(latest) as archive:
+        archive.extractall(folder := latest.with_suffix(""))
+    latest.unlink()
+    assert find_checkpoint(tmp_path / "run") == folder
+    tensor = next(folder.rglob("tensor_*.memmap"))
+    if what == "pickle":
+        (tensor.parent / "other.pickle").write_bytes(b"")
+    elif what == "cut":
+        tensor.write_bytes(b"")
+    else:
+        tensor.unlink()
+        os.mkfifo(tensor) if what == "fifo" else tensor.symlink_to("/dev/zero")
+    assert find_checkpoint(tmp_path / "run") == earlier
+    assert said == [f"{folder} is damaged: continuing from {earlier}."]
+    with pytest.raises(ValueError, match="not loaded|is damaged|no regular file"):
+        load_world_model(folder)
+
+
+@pytest.mark.parametrize("value", [10**9, 10**30, -1, float("nan"), True, "8", None, [1]])
+@pytest.mark.parametrize("field", ["image_size", "frame_skip", "latent_dim", "predictor_depth", "predictor_width", "history"])
+def test_sizes_of_a_card_that_the_weights_do_not_have_take_no_memory(finished, tmp_path, field, value):
+    path = tmp_path / "model.torchrl"
+    path.write_bytes(find_checkpoint(finished[0]).read_bytes())
+
+    def edit(name, content):
+        if not name.endswith("card/value.json"):
+            return content
+        card = json.loads(content)
+        card["model"][field] = value
+        return json.dumps(card)
+
+    repack(path, edit)
+    with pytest.raises(ValueError, match="not a whole checkpoint of a world model") as caught:
+        load_world_model(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "change", [{"model": []}, {"env": 3}, {"action_low": [1.0, 1.0], "action_high": [0.0, 0.0]}, {"action_low": "ab"}, {"config": None}]
+)
+def test_a_card_with_fields_of_other_types_is_refused(change):
+    good = {"model": {}, "env": "two_room", "env_kwargs": {}, "action_low": LOW, "action_high": HIGH, "config": {}}
+    ModelCard(**good)
+    with pytest.raises(ValueError, match="of a model's card must be"):
+        ModelCard(**{**good, **change})
+
+
+@pytest.mark.parametrize(("buffer", "value"), [("action_std", 0.0), ("action_std", -1.0), ("action_mean", float("nan"))])
+def test_statistics_that_no_data_have_are_refused(finished, tmp_path, buffer, value):
+    model, inverse_model, card = load_world_model(finished[0])
+    model.get_buffer(buffer).fill_(value)
+    Checkpoint(**checkpoint_components(model, inverse_model, card)).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=f"{buffer} (must be positive|holds a NaN)"):
+        load_world_model(tmp_path / "model")
+
+
+@pytest.mark.parametrize("card", [{}, {"env": "two_room"}])
+def test_a_pretrained_folder_without_a_whole_card_is_refused_in_one_line(finished, tmp_path, card):
+    pytest.importorskip("safetensors")
+    model, inverse_model, whole = load_world_model(finished[0])
+    save_pretrained(model, tmp_path, inverse_model, card)
+    with pytest.raises(ValueError, match="has no card|its card has no model, env_kwargs") as caught:
+        load_world_model(tmp_path)
+    assert "\n" not in str(caught.value)
+    save_pretrained(model, tmp_path, inverse_model, {**asdict(whole), "note": "of mine"})
+    assert load_world_model(tmp_path)[2] == whole
+
+
+class Lines(CheckpointAdapter):
+    """An adapter of a user, with a file of its own kind."""
+
+    adapter_id = "mine.lines"
+
+    def save(self, component, path, *, args, kwargs):
+        path.mkdir(parents=True, exist_ok=True)
+        (path / "lines.txt").write_text("\n".join(component))
+
+    def load(self, component, path, **settings):
+        component[:] = (path / "lines.txt").read_text().split("\n")
+
+
+def test_a_component_of_the_users_own_adapter_is_resumed(tmp_path):
+    lines = ["a", "b"]
+    trainer = make_trainer(tmp_path / "run")
+    trainer.checkpoint.register("lines", lines, adapter=Lines())
+    trainer.train()
+    again, read = make_trainer(tmp_path / "run"), []
+    again.checkpoint.register("lines", read, adapter=Lines())
+    assert again.resume() and read == lines
+    load_world_model(tmp_path / "run")
+    # Files of a component of ours are not let through by an entry of that kind at the same place.
+    path = find_checkpoint(tmp_path / "run")
+
+    def edit(name, content):
+        if name != "manifest.json":
+            return content
+        manifest = json.loads(content)
+        manifest["components"]["lines"]["path"] = manifest["components"]["world_model"]["path"]
+        return json.dumps(manifest)
+
+    repack(path, edit)
+    with pytest.raises(ValueError, match="not loaded"):
+        load_world_model(path)
+
+
+def test_the_sweep_removes_a_link_and_not_what_it_leads_to(finished, tmp_path):
+    shutil.copytree(finished[0], tmp_path / "run")
+    (thesis := tmp_path / "thesis").mkdir()
+    (thesis / "text").write_text("long")
+    (link := tmp_path / "run" / "checkpoints" / ".checkpoint-1.stage-1").symlink_to(thesis)
+    assert make_trainer(tmp_path / "run").resume()
+    assert not link.is_symlink() and (thesis / "text").read_text() == "long"
+
+
+def test_what_a_killed_loader_unpacked_is_removed_a_day_later(finished, tmp_path, monkeypatch):
+    """Neither what is newer, which a loader at work may read, nor what a link leads to."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    old, new, link = (tmp_path / f"torchrl-checkpoint-load-{name}" for name in ("old", "new", "link"))
+    (aim := tmp_path / "aim").mkdir()
+    old.mkdir(), new.mkdir(), link.symlink_to(aim)
+    (old / "file").write_text("")
+    for path in (old, aim):
+        os.utime(path, (0, 0))
+    load_world_model(finished[0])
+    assert {path.name for path in tmp_path.iterdir()} == {new.name, link.name, "aim"}
+
+
+def test_a_full_folder_of_temporary_files_is_named(finished, tmp_path, monkeypatch):
+    path = find_checkpoint(finished[0])
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    with pytest.raises(OSError, match=f"{path.name} cannot be unpacked in .*gone .*set TMPDIR"):
+        load_world_model(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import os
 import time
 
 import pytest
@@ -101,6 +102,39 @@ def test_a_table_takes_new_columns_and_loses_nothing(tmp_path):
         "1,train,0.5,",
         "1,evaluation,,1",
     ]
+
+
+@pytest.mark.parametrize(
+    "damage", [b"2,train," + b"9" * 200_000, b"2,train,\xff\x00", b"two,train,0.5", b"9" * 5000 + b",train,0.5", b'2,"train', b"2"]
+)
+def test_a_damaged_row_is_left_out_and_the_others_stay(tmp_path, damage):
+    """A row of another step, a field of 200 kB, bytes that are no text, half a row."""
+    table = CsvRows(tmp_path / "table.csv", first=("step", "split"))
+    table.append({"step": 1, "split": "train", "a": 0.5})
+    with open(table.path, "ab") as file:
+        file.write(damage + b"\r\n")
+    again = CsvRows(table.path)
+    again.append({"step": 3, "split": "train", "a": 0.25, "b": 1.0})  # a new column rewrites the file
+    again.drop_after(3)
+    lines = table.path.read_text().split()
+    assert lines[0] == "step,split,a,b" and lines[1] == "1,train,0.5," and lines[-1] == "3,train,0.25,1"
+
+
+@pytest.mark.parametrize("content", [b"9" * 200_000 + b"\r\n1,train,0.5\r\n", None], ids=["header", "fifo"])
+def test_a_table_that_is_none_is_refused_in_one_line(tmp_path, content):
+    path = tmp_path / "table.csv"
+    os.mkfifo(path) if content is None else path.write_bytes(content)
+    with pytest.raises(ValueError, match="table.csv is (damaged|a FIFO)") as caught:
+        CsvRows(path).drop_after(1)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_kept_in_memory_does_not_grow_with_the_run():
+    """Hooks find the latest numbers of each kind; the table has all."""
+    trainer = make_trainer(epochs=15, log_interval=1, validate=False)
+    trainer.train()
+    assert trainer.step == 135
+    assert 1 <= max(len(values) for values in trainer._log_dict.values()) <= 100
 
 
 def with_success(run_dir, rates: dict[int, float], **settings):

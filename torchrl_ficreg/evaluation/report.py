@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_ficreg._utils import write_atomic
+from torchrl_ficreg._utils import read_bytes, write_atomic
 from torchrl_ficreg.evaluation.distance import DistanceProfile
 from torchrl_ficreg.evaluation.mpc import Evaluation
 
@@ -34,15 +34,17 @@ def plot_learning_curve(metrics: Path, target: Path) -> None:
 
     Raises:
         ImportError: matplotlib is missing.
-        ValueError: the table holds no loss.
+        ValueError: the table holds no loss, or is damaged.
     """
     pyplot = _pyplot()
     curves: dict[str, dict[str, list[tuple[int, float]]]] = defaultdict(lambda: defaultdict(list))
-    with open(metrics, newline="") as file:
-        for row in csv.DictReader(file):
+    try:
+        for row in csv.DictReader(read_bytes(metrics).decode().splitlines()):
             for key, value in row.items():
-                if key.startswith("loss_") and value:
+                if key is not None and key.startswith("loss_") and value:
                     curves[key][row["split"]].append((int(row["step"]), float(value)))
+    except (csv.Error, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{metrics} is damaged ({str(error)[:80]}): restore it, or move it away.") from error
     if not curves:
         raise ValueError(f"{metrics} holds no loss: give the metrics.csv of a run that has begun to train.")
     figure, axes = pyplot.subplots(1, len(curves), figsize=(3.4 * len(curves), 2.8), squeeze=False)

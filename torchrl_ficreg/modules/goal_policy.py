@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 
 import torch
@@ -13,7 +12,20 @@ from tensordict.utils import NestedKey
 from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.feed import sort_keys
 from torchrl_ficreg.modules.goal_network import GoalNetwork
-from torchrl_ficreg.modules.safe_files import read_config, require_safetensors
+from torchrl_ficreg.modules.safe_files import (
+    as_float32,
+    check_kinds,
+    check_shapes,
+    check_sizes,
+    CHECKSUM,
+    config_file,
+    json_text,
+    read_config,
+    read_shapes,
+    read_tensors,
+    replace_files,
+    require_safetensors,
+)
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 FORMAT, VERSION = "torchrl_ficreg.goal_policy", 1
@@ -194,12 +206,9 @@ def save_goal_policy(policy: GoalPolicy, folder: Path | str, world_model: Latent
     policy.check_fits(world_model)
     content = {"format": FORMAT, "version": VERSION, "sizes": policy.sizes, "world_model": _checksum(world_model)}
     folder = Path(folder).expanduser()
-    folder.mkdir(parents=True, exist_ok=True)
-    # The configuration goes first and comes last: cut short, the folder holds no policy rather than a mixed one.
-    (folder / CONFIG_FILE).unlink(missing_ok=True)
-    tensors = {name: value.detach().float().cpu().contiguous() for name, value in policy.module.state_dict().items()}
-    safetensors.torch.save_file(tensors, folder / WEIGHTS_FILE, metadata={"format": "pt"})
-    (folder / CONFIG_FILE).write_text(json.dumps(content, indent=2) + "\n")
+    weights = safetensors.torch.save(as_float32(policy.module.state_dict()), metadata={"format": "pt"})
+    content[CHECKSUM] = hashlib.sha256(weights).hexdigest()
+    replace_files(folder, (WEIGHTS_FILE, weights), (CONFIG_FILE, json_text(content)))
     return folder
 
 
@@ -222,26 +231,30 @@ def load_goal_policy(
         ValueError: another format or version, damaged files, files that do not belong together, or a world model of
             other widths, encoder weights or action statistics than the policy's own.
     """
-    safetensors = require_safetensors()
+    require_safetensors()
     folder = Path(folder).expanduser()
-    for name in (CONFIG_FILE, WEIGHTS_FILE):
-        if not (folder / name).is_file():
-            raise FileNotFoundError(f"no {name} in {folder}: train a policy with train_policy.py checkpoint=...")
-    content = read_config(
-        folder / CONFIG_FILE, FORMAT, VERSION, instead="give a folder that save_goal_policy wrote."
-    )
+    weights, config = folder / WEIGHTS_FILE, config_file(folder / WEIGHTS_FILE, folder / CONFIG_FILE)
+    for file in (config, weights):
+        if not file.exists():
+            raise FileNotFoundError(f"no {file.name} in {folder}: train a policy with train_policy.py checkpoint=...")
+    content = read_config(config, FORMAT, VERSION, instead="give a folder that save_goal_policy wrote.")
+    shapes = read_shapes(weights)
     try:
-        tensors = safetensors.torch.load_file(folder / WEIGHTS_FILE)
-    except safetensors.SafetensorError as error:
-        raise ValueError(f"{folder / WEIGHTS_FILE} is damaged ({error}): train the policy again.") from error
-    try:
-        policy, checksum = GoalPolicy(**content["sizes"]), content["world_model"]
-        policy.module.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError) as error:  # a missing field, a foreign one, tensors of another network
-        reason = " ".join(str(error).split())
+        sizes, checksum = content["sizes"], content["world_model"]
+        check_sizes(sizes, len(shapes))
+        with torch.device("meta"):
+            wanted = GoalPolicy(**sizes).module.state_dict()
+        check_shapes(wanted, shapes)
+    # A missing field, a foreign one, tensors of another network.
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:160]
         raise ValueError(
             f"{folder}: {CONFIG_FILE} and {WEIGHTS_FILE} do not belong together ({reason}): train the policy again."
         ) from error
+    tensors = read_tensors(weights, content.get(CHECKSUM))
+    check_kinds(wanted, tensors)
+    policy = GoalPolicy(**sizes)
+    policy.module.load_state_dict(tensors)
     policy.check_fits(world_model)
     if checksum != _checksum(world_model):
         raise ValueError(

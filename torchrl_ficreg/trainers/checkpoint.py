@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import shutil
+import stat
+import tempfile
+import time
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +22,11 @@ import torch
 from torchrl import torchrl_logger
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
+from torchrl_ficreg._utils import MOST_JSON_BYTES, read_json, require_regular_file
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
 from torchrl_ficreg.modules.presets import make_world_model, ModelConfig
 from torchrl_ficreg.modules.pretrained.folder import load_pretrained, WEIGHTS_FILE
+from torchrl_ficreg.modules.safe_files import check_kinds, check_numbers, check_shapes, check_sizes, state_of
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 CHECKPOINTS = "checkpoints"
@@ -27,8 +34,12 @@ SUCCESS = "success_rate"  # in the manifest of a checkpoint; negative where it w
 _CARD, _MODEL, _INVERSE = "card", "world_model", "inverse_model"
 _MEMBERS = re.compile(r"manifest\.json|components/[\w.%-]+/(value\.json|state\.json|state/(meta\.json|tensor_\d+\.memmap))")
 _FOLDER = {"shape": [], "_type": "<class 'tensordict._td.TensorDict'>"}  # what meta.json notes beside tensors
-_MOST_JSON = 64 * 2**20  # bytes of one text file of a checkpoint
-DAMAGES = (CheckpointError, zipfile.BadZipFile, EOFError)  # what reading a damaged or foreign checkpoint raises
+_PLACE = re.compile(r"components/[\w.%-]+")  # of one component
+_MANIFEST = "manifest.json"
+_UNPACKED_SECONDS = 24 * 3600.0  # no loader takes as long
+_MOST_UNPACKED = 16  # times the size of an archive: what trained weights and moments never shrink by
+# What reading a damaged or foreign checkpoint raises.
+DAMAGES = (CheckpointError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError)
 
 
 @dataclass(frozen=True)
@@ -41,6 +52,9 @@ class ModelCard:
         env_kwargs: how that environment was made.
         action_low, action_high: bounds of a raw action [A], environment units.
         config: the whole resolved configuration of the run that made it.
+
+    Raises:
+        ValueError: a field of another type, or bounds that are no two lists of one length.
     """
 
     model: dict[str, Any]
@@ -49,6 +63,19 @@ class ModelCard:
     action_low: list[float]
     action_high: list[float]
     config: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        kinds = {"model": dict, "env": str, "env_kwargs": dict, "config": dict}
+        for name, kind in kinds.items():
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name} of a model's card must be a {kind.__name__}, got {str(getattr(self, name))[:40]!r}.")
+        bounds = self.action_low, self.action_high
+        lists = all(isinstance(bound, (list, tuple)) and all(isinstance(n, (int, float)) for n in bound) for bound in bounds)
+        if not lists or not 0 < len(bounds[0]) == len(bounds[1]) or not all(a <= b for a, b in zip(*bounds)):
+            raise ValueError(
+                f"action_low={str(bounds[0])[:40]} and action_high={str(bounds[1])[:40]} of a model's card must be two lists "
+                "of as many numbers, low <= high."
+            )
 
     @property
     def action_dim(self) -> int:
@@ -70,22 +97,34 @@ def find_checkpoint(path: Path | str, *, best: bool = False) -> Path:
         path: of either.
         best: of a run directory, the one of the highest success instead, see :class:`SuccessRate`.
 
+    Damaged checkpoints of a run directory are passed over, with a warning.
+
     Raises:
         FileNotFoundError: there is none, or success was never measured.
+        ValueError: all are damaged.
     """
     path = Path(path).expanduser()
-    if Checkpoint.is_checkpoint(path):
+    if _is_checkpoint(path):
         return path
     for directory in (path / CHECKPOINTS, path):
-        rotation = CheckpointRotation(directory, keep_last=1, keep_best=(SUCCESS, "max"))
-        found = (rotation.best() if best else rotation.latest()) if directory.is_dir() else None
-        if found is not None and best and Checkpoint.manifest(found)["metadata"][SUCCESS] < 0:
-            found = None
+        if best:
+            rates = {file: _success(file) for file in checkpoints_in(directory) if _is_checkpoint(file)}
+            ranked = sorted((file for file in rates if rates[file] >= 0), key=lambda file: rates[file])
+            found = next((file for file in reversed(ranked) if not _damage(file)), None)
+        else:
+            found = latest_whole(CheckpointRotation(directory, keep_last=1))
         if found is not None:
             return found
     if best:
         raise FileNotFoundError(f"no checkpoint with a measured success at {path}: train with evaluation.every=1, say.")
     raise FileNotFoundError(f"no checkpoint at {path}: give a run directory that train.py made, or a checkpoint in it.")
+
+
+def checkpoints_in(directory: Path, prefix: str = "checkpoint") -> list[Path]:
+    """What bears the name of a checkpoint of a run, the oldest first; nothing is read."""
+    step = re.compile(rf"{re.escape(prefix)}-(\d+)(\.torchrl)?", re.ASCII)
+    found = [(int(match[1]), file) for file in directory.glob(f"{prefix}-*") if (match := step.fullmatch(file.name))]
+    return [file for _, file in sorted(found)]
 
 
 def latest_whole(rotation: CheckpointRotation) -> Path | None:
@@ -96,26 +135,86 @@ def latest_whole(rotation: CheckpointRotation) -> Path | None:
     Raises:
         ValueError: damaged ones are all there is: a new run would overwrite them.
     """
-    known = rotation.checkpoints()
-    whole = next((path for path in reversed(known) if _is_whole(path)), None)
-    later = known if whole is None else known[known.index(whole) + 1 :]
-    for path in sorted(rotation.directory.glob(f"{rotation.prefix}-*")):
-        if path in known and path not in later:
+    damaged: list[tuple[Path, str]] = []
+    for path in reversed(checkpoints_in(rotation.directory, rotation.prefix)):
+        reason = _damage(path)
+        if reason is None:
+            for later, why in reversed(damaged):
+                torchrl_logger.warning(f"{later} is damaged: continuing from {path}.")
+                torchrl_logger.debug(why)
+            return path
+        damaged.append((path, reason))
+    if damaged:
+        path, reason = damaged[-1]
+        raise ValueError(f"{path} is damaged and there is no other checkpoint: move it away to begin again ({reason}).")
+    return None
+
+
+def set_odd_aside(rotation: CheckpointRotation) -> None:
+    """Renames what bears the name of a checkpoint and would stop TorchRL's rotation, which reads every manifest.
+
+    It passes over archives that were cut short, but not over FIFOs, or manifests of gigabytes or of other types.
+    """
+    for path in checkpoints_in(rotation.directory, rotation.prefix):
+        if _is_checkpoint(path):
             continue
-        if whole is None:
-            raise ValueError(f"{path} is damaged and there is no other checkpoint: move it away to begin again.")
-        torchrl_logger.warning(f"{path} is damaged: continuing from {whole}.")
-    return whole
+        try:
+            if not path.is_dir():
+                require_regular_file(path)
+            if path.is_dir() or zipfile.is_zipfile(path):
+                read_manifest(path)
+        except (OSError, ValueError):
+            path.rename(path.with_name(f"damaged-{path.name}"))
 
 
-def _is_whole(path: Path) -> bool:
-    if path.is_dir():
-        return True
+def _damage(path: Path) -> str | None:
+    """Why a checkpoint cannot be loaded, None where it can; reads the whole file."""
     try:
+        check_members(path)
+        if path.is_dir():
+            return None
         with zipfile.ZipFile(path) as archive:
-            return archive.testzip() is None
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, RuntimeError):
-        return False  # what a flipped byte makes zipfile raise depends on where it is
+            name = archive.testzip()
+        return None if name is None else f"{name[:80]} has another checksum"
+    # What a flipped byte makes zipfile raise depends on where it is.
+    except (*DAMAGES, OSError, ValueError, RuntimeError) as error:
+        return " ".join(str(error).split())[:200]
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The manifest of a checkpoint, whose size and type are checked before TorchRL reads it.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is damaged, or that of something else.
+    """
+    try:
+        if path.is_dir():
+            content = read_json(path / _MANIFEST, "manifest")
+        else:
+            with _members(path) as (sizes, read):
+                if sizes.get(_MANIFEST, 0) > MOST_JSON_BYTES:
+                    raise ValueError(f"{_MANIFEST} takes {sizes[_MANIFEST]} bytes")
+                content = json.loads(read(_MANIFEST))
+        if not isinstance(content, dict) or not isinstance(content.get("metadata", {}), dict):
+            raise ValueError("no JSON object")
+        return Checkpoint.manifest(path)
+    except (*DAMAGES, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise ValueError(f"{path} has no manifest of a checkpoint ({' '.join(str(error).split())[:160]}).") from error
+
+
+def _is_checkpoint(path: Path) -> bool:
+    try:
+        read_manifest(path)
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _success(path: Path) -> float:
+    """The success rate that a checkpoint notes, negative where it was not measured."""
+    rate = read_manifest(path).get("metadata", {}).get(SUCCESS, -1.0)
+    return float(rate) if isinstance(rate, (int, float)) and math.isfinite(rate) else -1.0
 
 
 def check_members(path: Path | str) -> None:
@@ -130,13 +229,19 @@ def check_members(path: Path | str) -> None:
     Raises:
         ValueError: it holds files or entries other than the trainer writes, or a tensor file of another size than noted.
     """
-    with _members(Path(path).expanduser()) as (sizes, read):
+    path = Path(path).expanduser()
+    foreign = _foreign_places(read_manifest(path))
+    with _members(path) as (sizes, read):
         for name, size in sizes.items():
+            if name.startswith(foreign):
+                continue
             if not _MEMBERS.fullmatch(name):
                 raise ValueError(f"{path} holds {name[:80]!r}, which no checkpoint of this package has: it is not loaded.")
-            if name.endswith(".json") and size > _MOST_JSON:
-                raise ValueError(f"{path} is damaged: {name} takes {size} bytes, expected at most {_MOST_JSON}.")
-        for name in (name for name in sizes if name.endswith("state/meta.json")):
+            if name.endswith(".json") and size > MOST_JSON_BYTES:
+                raise ValueError(f"{path} is damaged: {name} takes {size} bytes, expected at most {MOST_JSON_BYTES}.")
+        for name in (name for name in sizes if name.endswith("/state.json") and not name.startswith(foreign)):
+            _check_references(path, name, read)
+        for name in (name for name in sizes if name.endswith("state/meta.json") and not name.startswith(foreign)):
             try:
                 notes = json.loads(read(name))
                 whole = all(notes.pop(key) == value for key, value in _FOLDER.items())
@@ -155,6 +260,38 @@ def check_members(path: Path | str) -> None:
                     raise ValueError(f"{path} is damaged: {folder}{key}.memmap has {size} bytes, expected {need}.")
 
 
+def _foreign_places(manifest: Mapping[str, Any]) -> tuple[str, ...]:
+    """Where the files of components lie that an adapter of the user wrote.
+
+    Only that adapter reads them: TorchRL loads a component by the adapter that its manifest names, and refuses others.
+    """
+    records = manifest["components"].values()
+    own = {record["path"] for record in records if record["adapter"].startswith("torchrl.")}
+    others = {record["path"] for record in records} - own
+    return tuple(f"{place}/" for place in others if _PLACE.fullmatch(place))
+
+
+def _check_references(path: Path, name: str, read: Callable[[str], bytes]) -> None:
+    """Each tensor of a state is named once: loading copies it as often as it is named.
+
+    Raises:
+        ValueError: one is named again, or it is no JSON.
+    """
+    seen: list[Any] = []
+
+    def note(values: dict[str, Any]) -> dict[str, Any]:
+        if values.get("kind") in ("tensor", "numpy"):
+            seen.append(str(values.get("key")))
+        return values
+
+    try:
+        json.loads(read(name), object_hook=note)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: {name} is no readable JSON ({str(error)[:80]}).") from error
+    if len(set(seen)) != len(seen):
+        raise ValueError(f"{path}: {name} names a tensor more than once: it is not loaded.")
+
+
 def _bytes_of(entry: dict[str, Any]) -> int:
     """Size of the tensor that an entry of ``meta.json`` notes.
 
@@ -164,6 +301,8 @@ def _bytes_of(entry: dict[str, Any]) -> int:
     dtype = getattr(torch, entry["dtype"].removeprefix("torch."))
     if entry["is_nested"] or entry.keys() != {"device", "shape", "dtype", "is_nested"} or not isinstance(dtype, torch.dtype):
         raise ValueError("no plain tensor")
+    if any(type(size) is not int or size < 0 for size in entry["shape"]):
+        raise ValueError("no shape")
     return math.prod(entry["shape"]) * dtype.itemsize
 
 
@@ -172,7 +311,7 @@ def _members(path: Path) -> Iterator[tuple[dict[str, int], Callable[[str], bytes
     """Sizes of the regular files of an archive or a folder, by their names inside it, and how to read one.
 
     Raises:
-        ValueError: it holds a link, a FIFO or a device.
+        ValueError: it holds a link, a FIFO or a device, is no archive, or one that unpacks to far more than its size.
     """
     if path.is_dir():
         files = [file for file in sorted(path.rglob("*")) if file.is_symlink() or not file.is_dir()]
@@ -182,12 +321,26 @@ def _members(path: Path) -> Iterator[tuple[dict[str, int], Callable[[str], bytes
         yield {file.relative_to(path).as_posix(): file.stat().st_size for file in files}, lambda name: (path / name).read_bytes()
         return
     try:
+        size = require_regular_file(path).st_size
         archive = zipfile.ZipFile(path)
-    except (*DAMAGES, OSError) as error:
+    except (*DAMAGES, OSError, ValueError) as error:
         raise ValueError(f"{path} is not a whole checkpoint of a world model ({error}).") from error
+
+    def read(name: str) -> bytes:
+        try:
+            return archive.read(name)
+        except (*DAMAGES, KeyError, OSError, RuntimeError, ValueError) as error:
+            raise ValueError(f"{path} is damaged: {name} cannot be read ({' '.join(str(error).split())[:80]}).") from error
+
     with archive:
         entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-        yield {entry.filename: entry.file_size for entry in entries}, archive.read
+        for entry in entries:
+            if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"{path}: {entry.filename[:80]!r} is encrypted or packed in an unknown way: it is not loaded.")
+        need = sum(entry.file_size for entry in entries)
+        if need > _MOST_UNPACKED * size + 2**20:
+            raise ValueError(f"{path} has {size} bytes and would unpack to {need}: it is not loaded.")
+        yield {entry.filename: entry.file_size for entry in entries}, read
 
 
 def check_room(directory: Path, parameters: Iterable[torch.Tensor]) -> None:
@@ -213,10 +366,69 @@ def read_card(path: Path | str) -> ModelCard:
         ValueError: a checkpoint of another kind, or a damaged one.
     """
     check_members(path)
+    return _card(_load({_CARD: {}}, Path(path).expanduser()).get(_CARD), path)
+
+
+def _card(values: Any, path: Path | str) -> ModelCard:
+    """A card from its JSON values, of which others than its fields are left out.
+
+    Raises:
+        ValueError: a field is missing, or no field of a card.
+    """
+    names = [field.name for field in fields(ModelCard)]
+    missing = [name for name in names if name not in values] if isinstance(values, dict) else names
+    if missing:
+        raise ValueError(
+            f"{path} is not a whole checkpoint of a world model (its card has no {', '.join(missing)}): save it with a whole "
+            "card, as dataclasses.asdict(ModelCard(...)) gives it."
+        )
     try:
-        return ModelCard(**Checkpoint(card={}).load(path, components=[_CARD]).values[_CARD])
-    except (*DAMAGES, TypeError, KeyError) as error:
+        return ModelCard(**{name: values[name] for name in names})
+    except ValueError as error:
         raise ValueError(f"{path} is not a whole checkpoint of a world model ({error}).") from error
+
+
+class _State:
+    """A component that keeps the state it is given, without networks to load it into."""
+
+    def __init__(self) -> None:
+        self.state: Any = None
+
+    def state_dict(self) -> Any:
+        return self.state
+
+    def load_state_dict(self, state_dict: Any) -> None:
+        self.state = state_dict
+
+
+def sweep_unpacked() -> None:
+    """Removes archives that loaders of this user unpacked a day ago and, killed, left in the folder of temporary files."""
+    for left in Path(tempfile.gettempdir()).glob("torchrl-checkpoint-load-*"):
+        try:
+            found = left.lstat()
+            mine = not hasattr(os, "getuid") or found.st_uid == os.getuid()
+            if mine and stat.S_ISDIR(found.st_mode) and found.st_mtime < time.time() - _UNPACKED_SECONDS:
+                shutil.rmtree(left, ignore_errors=True)
+        except OSError:  # another process removed it
+            continue
+
+
+def _load(parts: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Reads components of a checkpoint, on the CPU; their values.
+
+    Raises:
+        OSError: an archive cannot be unpacked.
+        ValueError: a checkpoint of another kind, or a damaged one.
+    """
+    sweep_unpacked()
+    try:
+        return Checkpoint(**parts).load(path, components=list(parts), map_location="cpu").values
+    except OSError as error:
+        place = f"{path} cannot be unpacked in {tempfile.gettempdir()}" if path.is_file() else f"{path} cannot be read"
+        raise OSError(f"{place} ({error.strerror or error}): make room, or set TMPDIR to a folder on another disk.") from error
+    except (*DAMAGES, TypeError, KeyError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise ValueError(f"{path} is not a whole checkpoint of a world model ({reason}).") from error
 
 
 def load_world_model(path: Path | str) -> tuple[LatentWorldModel, InverseDynamicsModel | None, ModelCard]:
@@ -236,15 +448,29 @@ def load_world_model(path: Path | str) -> tuple[LatentWorldModel, InverseDynamic
     """
     if (Path(path).expanduser() / WEIGHTS_FILE).is_file():
         model, inverse_model, card = load_pretrained(Path(path).expanduser())
-        if card is None:
+        if not card:
             raise ValueError(f"{path} has no card, so its environment is unknown: save it with save_pretrained(card=).")
-        return model, inverse_model, ModelCard(**card)
+        card = _card(card, path)
+        if card.action_dim != len(model.action_mean):
+            raise ValueError(f"{path}: its card has bounds of {card.action_dim} actions, its model {len(model.action_mean)}.")
+        return model, inverse_model, card
     path = find_checkpoint(path)
     card = read_card(path)
+    kept = {_MODEL: _State(), _INVERSE: _State()}
+    _load(dict(kept), path)
     try:
-        model, inverse_model = make_world_model(ModelConfig(**card.model), card.action_dim)
-        parts = {_MODEL: model, _INVERSE: inverse_model}
-        Checkpoint(**parts).load(path, components=list(parts), map_location="cpu")
-    except (*DAMAGES, TypeError, KeyError) as error:
-        raise ValueError(f"{path} is not a whole checkpoint of a world model ({error}).") from error
-    return model.eval(), inverse_model.eval(), card
+        # Compared with what the file has before the networks take memory.
+        found = {f"{part}.{name}": value for part, holder in kept.items() for name, value in dict(holder.state).items()}
+        check_sizes(card.model, len(found))
+        with torch.device("meta"):
+            wanted = state_of(dict(zip(kept, make_world_model(ModelConfig(**card.model), card.action_dim))))
+        check_shapes(wanted, {name: tuple(value.shape) for name, value in found.items()})
+        check_kinds(wanted, found)
+        check_numbers(found, "its weights")
+        parts = dict(zip(kept, make_world_model(ModelConfig(**card.model), card.action_dim)))
+        for name, part in parts.items():
+            part.load_state_dict(kept[name].state)
+    except (ValueError, TypeError, KeyError, AttributeError, ArithmeticError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path} is not a whole checkpoint of a world model ({reason}).") from error
+    return parts[_MODEL].eval(), parts[_INVERSE].eval(), card

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+from collections import defaultdict, deque
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,15 @@ from torchrl.trainers.trainers import LRSchedulerHook
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.modules.memory import keep_freed_memory
 from torchrl_ficreg.modules.precision import Precision
-from torchrl_ficreg.trainers.checkpoint import check_members, check_room, CHECKPOINTS, DAMAGES, latest_whole
+from torchrl_ficreg.trainers.checkpoint import (
+    check_members,
+    check_room,
+    CHECKPOINTS,
+    DAMAGES,
+    latest_whole,
+    set_odd_aside,
+    sweep_unpacked,
+)
 from torchrl_ficreg.trainers.clock import Clock
 from torchrl_ficreg.trainers.distributed import from_main, is_main, rank, wait_for_all, world_size
 from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
@@ -31,6 +41,7 @@ from torchrl_ficreg.trainers.stream import ReadError, ReplayStream
 from torchrl_ficreg.trainers.tolerant import TolerantLogger
 
 METRICS = "metrics.csv"
+_KEPT = 100  # latest numbers of each kind in memory, for hooks such as TorchRL's EarlyStopping; all are in metrics.csv
 
 
 class OfflineTrainer(Trainer):
@@ -170,6 +181,7 @@ class OfflineTrainer(Trainer):
             ),
             checkpoint_rotation=rotation,
         )
+        self._log_dict = defaultdict(partial(deque, maxlen=_KEPT))
         self._checkpoint_skip_warnings.add("logger")  # it has no state, on purpose
         self.logger = TolerantLogger.around(logger) if is_main() else None
         self.schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, WarmupCosine(self.schedule_steps, warmup))
@@ -207,10 +219,15 @@ class OfflineTrainer(Trainer):
             FileNotFoundError: the run is past ``keep_epoch``, and that epoch's checkpoint was not kept.
             ValueError: the checkpoint is damaged, or belongs to other networks, data or hooks.
         """
-        latest = None if self.checkpoint_rotation is None else latest_whole(self.checkpoint_rotation)
+        rotation, latest = self.checkpoint_rotation, None
+        if rotation is not None:
+            latest = latest_whole(rotation)
+            if is_main():
+                set_odd_aside(rotation)
         latest = from_main(start if latest is None else latest)
         if latest is not None:
             check_members(latest)
+            sweep_unpacked()
             try:
                 checkpoint = Checkpoint() if self.checkpoint is None else self.checkpoint
                 # Every component takes its tensors to its own device; the one they came from may not exist here.
@@ -286,7 +303,7 @@ class OfflineTrainer(Trainer):
             return
         for pattern in (".*.stage-*", ".*.archive-*", ".*.delete-*"):
             for left in self.checkpoint_rotation.directory.glob(pattern):
-                shutil.rmtree(left) if left.is_dir() else left.unlink()
+                shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
 
     def train(self) -> None:
         """Runs to the end, or not at all when the resumed run had reached it.

@@ -5,13 +5,17 @@ from __future__ import annotations
 import csv
 import io
 import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from torchrl import torchrl_logger
 
-from torchrl_ficreg._utils import write_atomic
+from torchrl_ficreg._utils import NO_FOLLOW, NO_WAIT, read_bytes, write_atomic
+
+
+_STEP = re.compile(r"\d{1,18}", re.ASCII)
 
 
 class CsvRows:
@@ -57,8 +61,8 @@ class CsvRows:
         columns = list(dict.fromkeys([*(present or self._first), *(key for row in self._waiting for key in row)]))
         if columns != present:
             if present:
-                with open(self.path, newline="") as file:
-                    old = [*csv.DictReader(file)]
+                header, rows = _read(self.path)
+                old = [dict(zip(header, row)) for row in rows]
             self._replace(columns, [*old, *self._waiting])
         else:
             _append(self.path, _lines(columns, self._waiting))
@@ -67,25 +71,48 @@ class CsvRows:
     def _header(self) -> list[str] | None:
         """Columns of the file; None where there is no file, or none with a header."""
         if self._columns is None and self.path.exists():
-            with open(self.path, newline="") as file:
-                self._columns = next(csv.reader(file), None)
+            self._columns = _read(self.path)[0] or None
         return self._columns if self.path.exists() else None
 
     def _replace(self, columns: list[str], rows: list[dict[str, Any]]) -> None:
         write_atomic(self.path, _lines(columns, [dict(zip(columns, columns)), *rows]))
 
     def drop_after(self, step: int) -> None:
-        """Removes whole rows of later steps, and torn ones of any, in one piece."""
+        """Removes whole rows of later steps, and torn or damaged ones of any, in one piece.
+
+        Raises:
+            ValueError: the header is damaged, or there is no regular file.
+        """
         self._columns, self._waiting = None, []
         if not self.path.exists():
             return
-        with open(self.path, newline="") as file:
-            header, *rows = [*csv.reader(file)] or [[]]  # a kill may leave an empty file
-        kept = [dict(zip(header, row)) for row in rows if len(row) == len(header) and int(row[0]) <= step]
+        header, rows = _read(self.path)  # a kill may leave an empty file
+        whole = [row for row in rows if len(row) == len(header) and _STEP.fullmatch(row[0])]
+        kept = [dict(zip(header, row)) for row in whole if int(row[0]) <= step]
         if kept:
             self._replace(header, kept)
         else:
             self.path.unlink()
+
+
+def _read(path: Path) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of a table; rows that cannot be read are left out.
+
+    Raises:
+        ValueError: the header cannot be read, or there is no regular file.
+    """
+    first, *lines = read_bytes(path).decode(errors="replace").split("\n")
+    try:
+        header = next(csv.reader([first]), [])
+    except csv.Error as error:
+        raise ValueError(f"{path} is damaged ({error}, in its first line): restore it, or move it away.") from error
+    rows = []
+    for line in lines:
+        try:
+            rows += csv.reader([line])
+        except csv.Error:  # a field of more than 128 kB
+            continue
+    return header, [row for row in rows if row]
 
 
 def _lines(columns: list[str], rows: list[dict[str, Any]]) -> str:
@@ -96,7 +123,7 @@ def _lines(columns: list[str], rows: list[dict[str, Any]]) -> str:
 
 
 def _append(path: Path, text: str) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND)
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | NO_FOLLOW | NO_WAIT)
     try:
         before, data = os.fstat(descriptor).st_size, text.encode()
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,21 @@ from torchrl_ficreg.modules.pretrained.sizes import (
     Sizes,
     world_model_sizes,
 )
-from torchrl_ficreg.modules.safe_files import read_config, require_safetensors
+from torchrl_ficreg.modules.safe_files import (
+    as_float32,
+    check_kinds,
+    check_shapes,
+    check_sizes,
+    CHECKSUM,
+    config_file,
+    json_text,
+    read_config,
+    read_shapes,
+    read_tensors,
+    replace_files,
+    require_safetensors,
+    state_of,
+)
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 FORMAT, VERSION = "torchrl_ficreg.world_model", 1
@@ -77,19 +91,14 @@ def save_pretrained(
         "statistics": _statistics(model),
         "card": card,
     }
+    weights = safetensors.torch.save(as_float32(state_of(parts)), metadata={"format": "pt"})
+    content[CHECKSUM] = hashlib.sha256(weights).hexdigest()
     try:
-        text = json.dumps(content, indent=2)
-    except (TypeError, ValueError) as error:
+        text = json_text(content)
+    except (TypeError, ValueError, RecursionError) as error:
         raise TypeError(f"the card must hold JSON values only ({error}).") from error
-    tensors = {
-        f"{part}.{name}": (tensor.float() if tensor.is_floating_point() else tensor).detach().cpu().contiguous()
-        for part, module in parts.items()
-        for name, tensor in module.state_dict().items()
-    }
     folder = Path(folder).expanduser()
-    folder.mkdir(parents=True, exist_ok=True)
-    safetensors.torch.save_file(tensors, folder / WEIGHTS_FILE, metadata={"format": "pt"})
-    (folder / CONFIG_FILE).write_text(text + "\n")
+    replace_files(folder, (WEIGHTS_FILE, weights), (CONFIG_FILE, text))
     return folder
 
 
@@ -111,31 +120,46 @@ def load_pretrained(
         FileNotFoundError: no such files.
         ValueError: another format or version, damaged files, or files that do not belong together.
     """
-    safetensors = require_safetensors()
+    require_safetensors()
     folder = Path(folder).expanduser()
-    for name in (CONFIG_FILE, WEIGHTS_FILE):
-        if not (folder / name).is_file():
-            raise FileNotFoundError(f"no {name} in {folder}: give a folder that save_pretrained wrote.")
-    content = read_config(
-        folder / CONFIG_FILE, FORMAT, VERSION, instead="an official LeWM checkpoint is read by load_lewm."
-    )
+    weights, config = folder / WEIGHTS_FILE, config_file(folder / WEIGHTS_FILE, folder / CONFIG_FILE)
+    for file in (config, weights):
+        if not file.exists():
+            raise FileNotFoundError(f"no {file.name} in {folder}: give a folder that save_pretrained wrote.")
+    content = read_config(config, FORMAT, VERSION, instead="an official LeWM checkpoint is read by load_lewm.")
+    shapes = read_shapes(weights)
     try:
-        tensors = safetensors.torch.load_file(folder / WEIGHTS_FILE)
-    except safetensors.SafetensorError as error:
-        raise ValueError(f"{folder / WEIGHTS_FILE} is damaged ({error}).") from error
-    try:
-        model = build_world_model(content[_MODEL])
-        inverse_model = None if content[_INVERSE] is None else build_inverse_model(content[_INVERSE])
+        described = {_MODEL: content[_MODEL]} | ({} if content[_INVERSE] is None else {_INVERSE: content[_INVERSE]})
+        check_sizes(described, len(shapes))
+        with torch.device("meta"):
+            wanted = state_of(_build(described))
         statistics, card = content["statistics"], content["card"]
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{folder / CONFIG_FILE} does not describe a world model ({error!r}).") from error
-    parts: dict[str, nn.Module] = {_MODEL: model} | ({} if inverse_model is None else {_INVERSE: inverse_model})
-    _fill(parts, tensors, folder)
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:160] if isinstance(error, ValueError) else repr(error)[:160]
+        raise ValueError(f"{config} does not describe a world model ({reason}).") from error
+    if not isinstance(card, dict):
+        raise ValueError(f"{config}: card must be a JSON object, got {str(card)[:40]!r}.")
+    try:
+        check_shapes(wanted, shapes)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {WEIGHTS_FILE} does not fit {CONFIG_FILE}, {error}") from error
+    tensors = read_tensors(weights, content.get(CHECKSUM))
+    check_kinds(wanted, tensors)
+    parts = _build(described)
+    for part, module in parts.items():
+        module.load_state_dict({name: tensors[f"{part}.{name}"] for name in module.state_dict()})
+    model, inverse_model = parts[_MODEL], parts.get(_INVERSE)
     if _statistics(model) != statistics:
         raise ValueError(f"{folder}: {CONFIG_FILE} and {WEIGHTS_FILE} hold different statistics, they do not belong together.")
     for part in parts.values():
         part.to(device).eval()
     return model, inverse_model, card
+
+
+def _build(described: dict[str, Sizes]) -> dict[str, nn.Module]:
+    """The networks of a configuration, with fresh weights."""
+    builders = {_MODEL: build_world_model, _INVERSE: build_inverse_model}
+    return {part: builders[part](sizes) for part, sizes in described.items()}
 
 
 def _statistics(model: LatentWorldModel) -> dict[str, list[float]]:
@@ -157,17 +181,3 @@ def _check_card(card: dict[str, Any], model: LatentWorldModel, sizes: Sizes) -> 
     other = [f"{name} {named[name]}, not {value}" for name, value in ours.items() if named.get(name, value) != value]
     if other:
         raise ValueError(f"card['model'] describes another model: {', '.join(other)}.")
-
-
-def _fill(parts: dict[str, nn.Module], tensors: dict[str, torch.Tensor], folder: Path) -> None:
-    """Loads every tensor, none missing, left over or of another shape."""
-    wanted = {f"{part}.{name}": value for part, module in parts.items() for name, value in module.state_dict().items()}
-    differing = {name for name in wanted.keys() & tensors.keys() if wanted[name].shape != tensors[name].shape}
-    wrong = sorted((wanted.keys() ^ tensors.keys()) | differing)
-    if wrong:
-        raise ValueError(
-            f"{folder}: {WEIGHTS_FILE} does not fit {CONFIG_FILE}, {len(wrong)} tensors are missing, left over or of another "
-            f"shape: {', '.join(wrong[:8])}{' ...' if len(wrong) > 8 else ''}."
-        )
-    for part, module in parts.items():
-        module.load_state_dict({name: tensors[f"{part}.{name}"] for name in module.state_dict()})

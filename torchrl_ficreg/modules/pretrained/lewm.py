@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import json
+import io
 import pickle
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from torchrl_ficreg._utils import read_json, require_regular_file
 from torchrl_ficreg.data.statistics import ActionStatistics
 from torchrl_ficreg.modules.pretrained.lewm_config import config_from_sizes, sizes_from_config
 from torchrl_ficreg.modules.pretrained.lewm_names import matches, Naming, naming_of
 from torchrl_ficreg.modules.pretrained.sizes import build_world_model, world_model_sizes
+from torchrl_ficreg.modules.safe_files import check_kinds, check_numbers, check_sizes, config_file, json_text, replace_files
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 _CONFIG, _WEIGHTS = "config.json", "weights.pt"
@@ -65,10 +69,16 @@ def load_lewm(
     file, config = _find(Path(path).expanduser())
     tensors = _read_tensors(file)
     try:
-        model = build_world_model(sizes_from_config(config, tensors, frame_skip))
-        model.load_state_dict(_adopt(model, tensors))
-    except ValueError as error:
-        raise ValueError(f"{file} cannot be read as a LeWM checkpoint: {error}") from error
+        sizes = sizes_from_config(config, tensors, frame_skip)
+        check_sizes(sizes, len(tensors))
+        with torch.device("meta"):
+            described = build_world_model(sizes)
+        adopted = _adopt(described, tensors)
+        model = build_world_model(sizes)
+        model.load_state_dict(adopted | {name: model.get_buffer(name) for name in _STATISTICS})
+    except (ValueError, TypeError, RuntimeError, ArithmeticError, AttributeError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{file} cannot be read as a LeWM checkpoint: {reason}") from error
     if statistics is not None:
         model.statistics = statistics
     return model.to(device).eval()
@@ -106,9 +116,9 @@ def save_lewm(model: LatentWorldModel, folder: Path | str, *, naming: Naming = "
     for match in matches(sizes, naming):
         ours = state[match.ours].detach().cpu()
         published |= match.publish(ours.float() if ours.is_floating_point() else ours)
-    folder.mkdir(parents=True, exist_ok=True)
-    torch.save(published, folder / _WEIGHTS)
-    (folder / _CONFIG).write_text(json.dumps(config, indent=2) + "\n")
+    weights = io.BytesIO()
+    torch.save(published, weights)
+    replace_files(folder, (_WEIGHTS, weights.getvalue()), (_CONFIG, json_text(config)))
     return folder
 
 
@@ -124,13 +134,13 @@ def _find(path: Path) -> tuple[Path, dict[str, Any]]:
         path = files[0]
     if not path.is_file():
         raise FileNotFoundError(f"no LeWM checkpoint at {path}: give a folder with {_CONFIG} and {_WEIGHTS}.")
-    config = path.with_name(_CONFIG)
-    if not config.is_file():
+    config = config_file(path, path.with_name(_CONFIG))
+    if not config.exists():
         raise FileNotFoundError(f"no {_CONFIG} beside {path}: it names the sizes of the networks.")
     try:
-        content = json.loads(config.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{config} is not JSON ({error}).") from error
+        content = read_json(config)
+    except ValueError as error:
+        raise ValueError(f"{config} is not JSON ({error.__cause__ or error}).") from error
     if not isinstance(content, dict):
         raise ValueError(f"{config} must hold a JSON object, got {type(content).__name__}.")
     return path, content
@@ -138,9 +148,12 @@ def _find(path: Path) -> tuple[Path, dict[str, Any]]:
 
 def _read_tensors(file: Path) -> dict[str, torch.Tensor]:
     """Tensors of a checkpoint under their bare published names; nothing in the file is executed."""
+    size = require_regular_file(file).st_size
     try:
+        _check_archive(file, size)
         content = torch.load(file, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, UnicodeDecodeError) as error:
+    # A damaged pickle raises whatever its instructions meet.
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{file} is no plain state dict. Whole pickled modules (*_object.ckpt) and checkpoints with objects in "
             "them are refused, since reading them runs their code: save the state_dict() of the model, alone, where "
@@ -160,7 +173,29 @@ def _read_tensors(file: Path) -> dict[str, torch.Tensor]:
             what = "comes twice" if name in tensors else f"is a {type(value).__name__}, no tensor"
             raise ValueError(f"{file}: {name!r} {what}: save the state_dict() of the model alone.")
         tensors[name] = value
+    # A tensor may repeat the bytes of its storage, and several may share one: copied, they would take more than the file.
+    if any(value.device.type != "cpu" or value.layout != torch.strided for value in tensors.values()):
+        raise ValueError(f"{file} holds tensors that are not plain arrays: save the state_dict() of the model on the CPU.")
+    need = sum(value.numel() * value.element_size() for value in tensors.values())
+    if need > size:
+        raise ValueError(f"{file} has {size} bytes, its tensors would take {need}: it is damaged, restore it.")
+    check_numbers(tensors, file)
     return tensors
+
+
+def _check_archive(file: Path, size: int) -> None:
+    """Refuses an archive that unpacks to more than its size: PyTorch stores tensors as they are.
+
+    Raises:
+        ValueError: it does, or it is no archive, as PyTorch writes since 1.6.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            need = sum(entry.file_size for entry in archive.infolist())
+    except (zipfile.BadZipFile, zlib.error, OSError, NotImplementedError) as error:
+        raise ValueError(f"no archive of PyTorch: {error}") from error
+    if need > size:
+        raise ValueError(f"{size} bytes would unpack to {need}")
 
 
 def _bare(name: str) -> str:
@@ -171,7 +206,7 @@ def _bare(name: str) -> str:
 
 
 def _adopt(model: LatentWorldModel, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Our state from published tensors, every one of which must have its place."""
+    """Our state, without action statistics, from published tensors, every one of which must have its place."""
     state = model.state_dict()
     table = matches(world_model_sizes(model), naming_of(list(tensors)))
     shapes = {name: match.published_shape(state[match.ours]) for match in table for name in match.theirs}
@@ -185,8 +220,8 @@ def _adopt(model: LatentWorldModel, tensors: dict[str, torch.Tensor]) -> dict[st
     wrong = [f"{len(names)} {what} ({_listed(names)})" for what, names in found.items() if names]
     if wrong:
         raise ValueError(f"of {len(shapes)} tensors that config.json asks for: {'; '.join(wrong)}.")
-    adopted = {match.ours: match.adopt(tensors, like=state[match.ours]) for match in table}
-    return adopted | {name: state[name] for name in _STATISTICS}
+    check_kinds({name: state[match.ours] for match in table for name in match.theirs}, tensors)
+    return {match.ours: match.adopt(tensors, like=state[match.ours]) for match in table}
 
 
 def _listed(names: list[str], most: int = 12) -> str:

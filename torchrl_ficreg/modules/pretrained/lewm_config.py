@@ -88,6 +88,9 @@ def sizes_from_config(config: dict[str, Any], tensors: dict[str, torch.Tensor], 
             f"config.json: a predictor of width {width} between latents of width {ends[0]} and {ends[1]} holds "
             "projections that ours does not have; only equal widths can be read."
         )
+    dropout = config["predictor"].get("dropout", 0.0)
+    if isinstance(dropout, bool) or not isinstance(dropout, (int, float)) or not 0 <= dropout < 1:
+        raise ValueError(f"config.json: predictor.dropout must lie in [0, 1), got {str(dropout)[:40]!r}.")
     latent_dim = read("projector.output_dim", "projector.net.3.weight", 0)
     encoder = {
         "kind": "vit",
@@ -109,7 +112,8 @@ def sizes_from_config(config: dict[str, Any], tensors: dict[str, torch.Tensor], 
         "heads": read("predictor.heads"),
         "dim_head": read("predictor.dim_head", default=_DIM_HEAD),
         "mlp_dim": read("predictor.mlp_dim", "predictor.transformer.layers.0.mlp.net.1.weight", 0),
-        "dropout": float(config["predictor"].get("dropout", 0.0)),
+        "dropout": dropout,
+        "attention_dropout": dropout,  # the published predictor has one rate for both
         "projector_dim": read("pred_proj.hidden_dim", "pred_proj.net.0.weight", 0),
         "action_bottleneck": read("action_encoder.smoothed_dim", "action_encoder.patch_embed.weight", 0),
     }
@@ -133,6 +137,12 @@ def config_from_sizes(sizes: Sizes) -> dict[str, Any]:
         )
     if predictor["heads"] == 1 and predictor["dim_head"] == width:
         raise ValueError("LeWM's predictor has no output projection when a single head has the full width; ours has.")
+    rates = predictor["dropout"], predictor["attention_dropout"]
+    if rates[0] != rates[1]:
+        raise ValueError(
+            f"LeWM's predictor has one dropout for its layers and its attention weights, this one {rates[0]} and {rates[1]}: "
+            "build it with predictor_attention_dropout equal to predictor_dropout."
+        )
     vit = (encoder["width"], encoder["depth"], encoder["heads"], encoder["mlp_dim"])
     named = next((name for name, shape in _VIT_SIZES.items() if vit == (*shape, 4 * shape[0])), None)
     return {

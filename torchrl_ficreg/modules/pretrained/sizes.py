@@ -6,8 +6,10 @@ may have any size the networks can take, so what is stored beside weights is the
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 
@@ -24,6 +26,7 @@ from torchrl_ficreg.modules.vit import VisionTransformer, ViTEncoder
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 Sizes = dict[str, Any]
+_SETTINGS = ("p", "weight_dropout", "heads", "causal", "eps", "momentum", "approximate", "stride", "padding")
 
 
 def world_model_sizes(model: LatentWorldModel) -> Sizes:
@@ -31,6 +34,7 @@ def world_model_sizes(model: LatentWorldModel) -> Sizes:
 
     Raises:
         TypeError: networks other than the package's own.
+        ValueError: one of them was changed in a way that these numbers do not tell, such as the dropout of one layer.
 
     Examples:
         >>> from torchrl_ficreg import make_world_model, ModelConfig
@@ -38,11 +42,13 @@ def world_model_sizes(model: LatentWorldModel) -> Sizes:
         >>> world_model_sizes(model)["encoder"]["kind"]
         'conv'
     """
-    return {
+    sizes = {
         "encoder": _encoder_sizes(_network(model.encoder)),
         "predictor": _predictor_sizes(_network(model.predictor)),
         "frame_skip": model.frame_skip,
     }
+    _check_same(model, build_world_model, sizes)
+    return sizes
 
 
 def build_world_model(sizes: Sizes) -> LatentWorldModel:
@@ -57,6 +63,7 @@ def inverse_model_sizes(inverse_model: InverseDynamicsModel) -> Sizes:
 
     Raises:
         TypeError: a network other than the package's own.
+        ValueError: it was changed in a way that these numbers do not tell.
     """
     network = _network(inverse_model)
     kinds = {make: kind for kind, (make, _) in INVERSE_NETWORKS.items()}
@@ -75,7 +82,9 @@ def inverse_model_sizes(inverse_model: InverseDynamicsModel) -> Sizes:
         latent_dim, outputs = layers[0].in_features // 2, layers[-1].out_features
     action_dim = outputs // 2 if kind == "gaussian" else outputs
     sizes = {"latent_dim": latent_dim, "action_dim": action_dim, "hidden_dim": hidden_dim, "dropout": dropout}
-    return {"kind": kind, **sizes, **extra}
+    sizes = {"kind": kind, **sizes, **extra}
+    _check_same(inverse_model, build_inverse_model, sizes)
+    return sizes
 
 
 def build_inverse_model(sizes: Sizes) -> InverseDynamicsModel:
@@ -85,6 +94,32 @@ def build_inverse_model(sizes: Sizes) -> InverseDynamicsModel:
 
 def _network(module: nn.Module) -> nn.Module:
     return module.module if isinstance(module, TensorDictModule) else module
+
+
+def _check_same(module: nn.Module, build: Callable[[Sizes], nn.Module], sizes: Sizes) -> None:
+    """Compares what no weight tells, layer by layer, with the network that will be built from the sizes.
+
+    Raises:
+        ValueError: a rate or another setting of a layer differs.
+    """
+    with torch.device("meta"):
+        built = build(sizes)
+    theirs = dict(_layers(built))
+    for name, ours in _layers(module):
+        differing = [f"{key}={ours.get(key)}" for key in ours if ours.get(key) != theirs.get(name, {}).get(key)]
+        if differing:
+            raise ValueError(
+                f"layer {name} has {', '.join(differing)}, which the saved sizes do not tell: build the model with one rate "
+                "for all layers, and save it without changes to single ones."
+            )
+
+
+def _layers(module: nn.Module) -> Iterator[tuple[str, dict[str, Any]]]:
+    for name, layer in module.named_modules():
+        settings = {key: getattr(layer, key) for key in _SETTINGS if hasattr(layer, key)}
+        if not any(True for _ in layer.parameters()) and not any(True for _ in layer.buffers()):
+            settings["class"] = type(layer).__name__  # an activation
+        yield name.replace("_orig_mod.", ""), settings
 
 
 def _foreign(network: nn.Module, known) -> TypeError:
@@ -140,6 +175,7 @@ def _predictor_sizes(network: nn.Module) -> Sizes:
         "dim_head": block.attn.inner // block.attn.heads,
         "mlp_dim": block.mlp[0].out_features,
         "dropout": block.attn.dropout.p,
+        "attention_dropout": block.attn.weight_dropout,
         "projector_dim": network.projector.layer_in.out_features,
         "action_bottleneck": network.action_embedding.compress.out_features,
     }

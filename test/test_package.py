@@ -17,6 +17,7 @@ import torchrl_ficreg
 
 ROOT = Path(torchrl_ficreg.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
+SOURCES = [*FILES, *sorted((ROOT.parent / "sota-implementations").rglob("*.py"))]
 TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in FILES}
 MODULES = [info.name for info in pkgutil.walk_packages([str(ROOT)], "torchrl_ficreg.")]
 PACKAGES = ["torchrl_ficreg", *(f"torchrl_ficreg.{part}" for part in ("data", "envs", "modules", "objectives"))]
@@ -131,3 +132,13 @@ def test_annotations_are_lazy(path):
     """``from __future__ import annotations`` on top of every file that annotates anything."""
     annotated = [node for node in ast.walk(TREES[path]) if isinstance(node, (ast.FunctionDef, ast.AnnAssign))]
     assert not annotated or "__future__.annotations" in imports(TREES[path])
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=str)
+def test_text_files_are_utf_8_on_every_system(path):
+    """Windows takes another encoding unless told."""
+    for call in calls(ast.parse(path.read_text(encoding="utf-8"))):
+        name = getattr(call.func, "attr", getattr(call.func, "id", None))
+        mode = [argument.value for argument in call.args[1:2] if isinstance(argument, ast.Constant)]
+        text = name in ("read_text", "write_text") or getattr(call.func, "id", None) == "open" and "b" not in str(mode)
+        assert not text or "encoding" in {word.arg for word in call.keywords}, f"{path}:{call.lineno}"

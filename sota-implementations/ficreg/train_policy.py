@@ -159,7 +159,7 @@ def read_metrics(cfg: DictConfig, folder: Path, model: LatentWorldModel) -> dict
         ValueError: it was trained with other settings, or for other weights.
     """
     load_goal_policy(folder, model)
-    metrics = json.loads((folder / METRICS).read_text())
+    metrics = json.loads((folder / METRICS).read_text(encoding="utf-8"))
     ours, theirs = flatten(OmegaConf.to_container(cfg)), flatten(metrics["config"])
     differ = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key) and key not in _FREE]
     if differ:

@@ -110,11 +110,11 @@ class SeekableReplayBuffer(TensorDictReplayBuffer):
     def dumps(self, path: str | Path) -> None:
         """Saves :meth:`state_dict` in a directory."""
         Path(path).mkdir(parents=True, exist_ok=True)
-        (Path(path) / _STATE_FILE).write_text(json.dumps(self.state_dict()))
+        (Path(path) / _STATE_FILE).write_text(json.dumps(self.state_dict()), encoding="utf-8")
 
     def loads(self, path: str | Path) -> None:
         """Loads what :meth:`dumps` saved."""
-        self.load_state_dict(json.loads((Path(path) / _STATE_FILE).read_text()))
+        self.load_state_dict(json.loads((Path(path) / _STATE_FILE).read_text(encoding="utf-8")))
 
     def _use_one_reader(self) -> None:
         # TorchRL starts as many threads as batches to prefetch. They take turns at one lock in no fixed order, so

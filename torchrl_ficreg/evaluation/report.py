@@ -38,7 +38,7 @@ def plot_learning_curve(metrics: Path, target: Path) -> None:
     """
     pyplot = _pyplot()
     curves: dict[str, dict[str, list[tuple[int, float]]]] = defaultdict(lambda: defaultdict(list))
-    with open(metrics, newline="") as file:
+    with open(metrics, newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             for key, value in row.items():
                 if key.startswith("loss_") and value:

@@ -196,7 +196,7 @@ def save_goal_policy(policy: GoalPolicy, folder: Path | str, world_model: Latent
     (folder / CONFIG_FILE).unlink(missing_ok=True)
     tensors = {name: value.detach().float().cpu().contiguous() for name, value in policy.module.state_dict().items()}
     safetensors.torch.save_file(tensors, folder / WEIGHTS_FILE, metadata={"format": "pt"})
-    (folder / CONFIG_FILE).write_text(json.dumps(content, indent=2) + "\n")
+    (folder / CONFIG_FILE).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return folder
 
 

@@ -33,7 +33,7 @@ def read_config(file: Path, kind: str, version: int, *, instead: str) -> dict[st
         ValueError: it is not JSON, or of another format or version.
     """
     try:
-        content = json.loads(file.read_text())
+        content = json.loads(file.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{file} is not JSON ({error}): is it damaged?") from error
     if not isinstance(content, dict) or content.get("format") != kind:

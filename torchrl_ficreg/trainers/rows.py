@@ -11,7 +11,7 @@ from typing import Any
 
 from torchrl import torchrl_logger
 
-from torchrl_ficreg._utils import write_atomic
+from torchrl_ficreg._utils import BINARY, write_all, write_atomic
 
 
 class CsvRows:
@@ -57,7 +57,7 @@ class CsvRows:
         columns = list(dict.fromkeys([*(present or self._first), *(key for row in self._waiting for key in row)]))
         if columns != present:
             if present:
-                with open(self.path, newline="") as file:
+                with open(self.path, newline="", encoding="utf-8") as file:
                     old = [*csv.DictReader(file)]
             self._replace(columns, [*old, *self._waiting])
         else:
@@ -67,7 +67,7 @@ class CsvRows:
     def _header(self) -> list[str] | None:
         """Columns of the file; None where there is no file, or none with a header."""
         if self._columns is None and self.path.exists():
-            with open(self.path, newline="") as file:
+            with open(self.path, newline="", encoding="utf-8") as file:
                 self._columns = next(csv.reader(file), None)
         return self._columns if self.path.exists() else None
 
@@ -79,7 +79,7 @@ class CsvRows:
         self._columns, self._waiting = None, []
         if not self.path.exists():
             return
-        with open(self.path, newline="") as file:
+        with open(self.path, newline="", encoding="utf-8") as file:
             header, *rows = [*csv.reader(file)] or [[]]  # a kill may leave an empty file
         kept = [dict(zip(header, row)) for row in rows if len(row) == len(header) and int(row[0]) <= step]
         if kept:
@@ -96,12 +96,11 @@ def _lines(columns: list[str], rows: list[dict[str, Any]]) -> str:
 
 
 def _append(path: Path, text: str) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND)
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | BINARY)
     try:
-        before, data = os.fstat(descriptor).st_size, text.encode()
+        before = os.fstat(descriptor).st_size
         try:
-            while data:
-                data = data[os.write(descriptor, data) :]
+            write_all(descriptor, text.encode())
         except OSError:
             os.ftruncate(descriptor, before)
             raise

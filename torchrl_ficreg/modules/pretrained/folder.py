@@ -89,7 +89,7 @@ def save_pretrained(
     folder = Path(folder).expanduser()
     folder.mkdir(parents=True, exist_ok=True)
     safetensors.torch.save_file(tensors, folder / WEIGHTS_FILE, metadata={"format": "pt"})
-    (folder / CONFIG_FILE).write_text(text + "\n")
+    (folder / CONFIG_FILE).write_text(text + "\n", encoding="utf-8")
     return folder
 
 

@@ -108,7 +108,7 @@ def save_lewm(model: LatentWorldModel, folder: Path | str, *, naming: Naming = "
         published |= match.publish(ours.float() if ours.is_floating_point() else ours)
     folder.mkdir(parents=True, exist_ok=True)
     torch.save(published, folder / _WEIGHTS)
-    (folder / _CONFIG).write_text(json.dumps(config, indent=2) + "\n")
+    (folder / _CONFIG).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
     return folder
 
 
@@ -128,7 +128,7 @@ def _find(path: Path) -> tuple[Path, dict[str, Any]]:
     if not config.is_file():
         raise FileNotFoundError(f"no {_CONFIG} beside {path}: it names the sizes of the networks.")
     try:
-        content = json.loads(config.read_text())
+        content = json.loads(config.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{config} is not JSON ({error}).") from error
     if not isinstance(content, dict):

@@ -123,6 +123,12 @@ class SeekableReplayBuffer(TensorDictReplayBuffer):
             self._prefetch_executor.shutdown(wait=False)
             self._prefetch_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="clips")
 
+    def __getstate__(self) -> dict[str, Any]:
+        # TorchRL copies the prefetched batches here. A spawned process would get them by file descriptors, which are
+        # closed with the copies, before it has started; it draws these batches again.
+        return {**super().__getstate__(), "_prefetch_state": None}
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._use_one_reader()
+        self.seek(self._delivered)

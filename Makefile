@@ -5,14 +5,25 @@ RUN := $(VENV)/bin/python
 READY := $(VENV)/.ready
 TESTABLE := $(VENV)/.ready-test
 PYTEST := $(RUN) -m pytest
+PYTHONS := 3.10 3.11 3.12 3.13
+FAST := test/test_package.py test/test_without_posix.py test/data test/objectives test/trainers/test_checkpoints.py
 
-.PHONY: train test slow lint docs study clean
+.PHONY: train test test-pythons slow lint docs study clean
 
 train: $(READY)
 	$(RUN) sota-implementations/ficreg/train.py $(ARGS)
 
 test: $(TESTABLE)
 	$(PYTEST) $(ARGS)
+
+# The fast part of the tests on every Python of $(PYTHONS) that this machine has (pyenv's too), each in .venv-3.XX.
+test-pythons:
+	@for version in $(PYTHONS); do \
+		python=$$(ls -d $$(command -v python$$version) $(HOME)/.pyenv/versions/$$version.*/bin/python 2>/dev/null | tail -1); \
+		if ! $${python:-false} -c '' 2>/dev/null; then echo "no Python $$version here"; continue; fi; \
+		echo "Python $$version"; \
+		$(MAKE) --no-print-directory PYTHON=$$python VENV=.venv-$$version test ARGS="$(FAST) $(ARGS)" || exit 1; \
+	done
 
 slow: $(TESTABLE)
 	$(PYTEST) -m slow $(ARGS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import doctest
 import importlib
+import importlib.util
 import inspect
 import pkgutil
 import subprocess
@@ -14,9 +15,11 @@ from pathlib import Path
 import pytest
 
 import torchrl_ficreg
+from torchrl_ficreg.envs.gl import how_to_install
 
 ROOT = Path(torchrl_ficreg.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
+SOURCES = [*FILES, *sorted((ROOT.parent / "sota-implementations").rglob("*.py"))]
 TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in FILES}
 MODULES = [info.name for info in pkgutil.walk_packages([str(ROOT)], "torchrl_ficreg.")]
 PACKAGES = ["torchrl_ficreg", *(f"torchrl_ficreg.{part}" for part in ("data", "envs", "modules", "objectives"))]
@@ -31,6 +34,7 @@ BELOW = {
     "trainers": {"data", "modules", "objectives"},
     "evaluation": {"data", "modules", "objectives", "trainers", "envs"},
 }
+SIMULATORS = {"torchrl_ficreg.envs.cube": "ogbench", "torchrl_ficreg.envs.reacher": "dm_control"}
 HEAVY = "pymunk mujoco dm_control ogbench h5py hdf5plugin lance safetensors PIL".split()
 HEAVY += "wandb matplotlib imageio pygame transformers".split()
 
@@ -81,6 +85,9 @@ def test_every_part_is_on_the_street():
 
 @pytest.mark.parametrize("name", MODULES)
 def test_the_examples_in_docstrings_run(name):
+    for part, needed in SIMULATORS.items():
+        if name.startswith(part) and importlib.util.find_spec(needed) is None:
+            pytest.skip(f"{needed} is not installed: {how_to_install(needed)}")
     failed, _ = doctest.testmod(importlib.import_module(name))
     assert failed == 0
 
@@ -131,3 +138,13 @@ def test_annotations_are_lazy(path):
     """``from __future__ import annotations`` on top of every file that annotates anything."""
     annotated = [node for node in ast.walk(TREES[path]) if isinstance(node, (ast.FunctionDef, ast.AnnAssign))]
     assert not annotated or "__future__.annotations" in imports(TREES[path])
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=str)
+def test_text_files_are_utf_8_on_every_system(path):
+    """Windows takes another encoding unless told."""
+    for call in calls(ast.parse(path.read_text(encoding="utf-8"))):
+        name = getattr(call.func, "attr", getattr(call.func, "id", None))
+        mode = [argument.value for argument in call.args[1:2] if isinstance(argument, ast.Constant)]
+        text = name in ("read_text", "write_text") or getattr(call.func, "id", None) == "open" and "b" not in str(mode)
+        assert not text or "encoding" in {word.arg for word in call.keywords}, f"{path}:{call.lineno}"

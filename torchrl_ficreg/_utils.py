@@ -13,10 +13,15 @@ from typing import Any
 
 MOST_JSON_BYTES = 64 * 2**20
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
 # Neither exists on Windows. O_NONBLOCK: opening a FIFO returns at once, also where one replaced the file after a look.
 NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 NO_WAIT = getattr(os, "O_NONBLOCK", 0)
-_BINARY = getattr(os, "O_BINARY", 0)
+BINARY = getattr(os, "O_BINARY", 0)  # only Windows has it: without it a descriptor there turns every \n into \r\n
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP)
 _QUIET_SECONDS = 2.0
 
@@ -43,7 +48,7 @@ def write_atomic(path: str | Path, data: bytes | str) -> None:
     """
     path = Path(path)
     part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
-    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | NO_FOLLOW | _BINARY, 0o644)
+    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | NO_FOLLOW | BINARY, 0o644)
     try:
         try:
             write_all(descriptor, data.encode() if isinstance(data, str) else data)
@@ -101,7 +106,7 @@ def read_bytes(path: str | Path, *, most: int | None = None) -> bytes:
         ValueError: it is no regular file, or larger than ``most``.
     """
     require_regular_file(path)
-    descriptor = os.open(path, os.O_RDONLY | NO_WAIT | _BINARY)
+    descriptor = os.open(path, os.O_RDONLY | NO_WAIT | BINARY)
     with open(descriptor, "rb") as file:
         size = os.fstat(descriptor).st_size
         if most is not None and size > most:
@@ -159,10 +164,6 @@ def lock_file(descriptor: int, path: str | Path, *, wait: bool = False) -> bool:
     from torchrl import torchrl_logger
 
     try:
-        import fcntl
-    except ImportError:  # Windows
-        fcntl = None
-    try:
         if fcntl is None:
             raise OSError(errno.ENOSYS, "this system has none")
         begin = time.monotonic()
@@ -188,10 +189,27 @@ def lock_file(descriptor: int, path: str | Path, *, wait: bool = False) -> bool:
         return False
 
 
+def lock_folder(path: str | Path) -> bool:
+    """Takes the exclusive lock of a folder until the process ends.
+
+    Args:
+        path: the folder.
+
+    Returns:
+        False, with a warning, where the system or the file system has no locks.
+
+    Raises:
+        BlockingIOError: another process holds it.
+        OSError: any other error.
+    """
+    descriptor = -1 if fcntl is None else os.open(path, os.O_RDONLY)  # Windows opens no folders
+    return lock_file(descriptor, path)
+
+
 def _holder(descriptor: int) -> str:
     """The part of a message that names the holder, from Linux's table of locks; empty where unknown."""
     try:
-        found, locks = os.fstat(descriptor), Path("/proc/locks").read_text().splitlines()
+        found, locks = os.fstat(descriptor), Path("/proc/locks").read_text(encoding="utf-8").splitlines()
     except OSError:
         return ""
     name = f"{os.major(found.st_dev):02x}:{os.minor(found.st_dev):02x}:{found.st_ino}"

@@ -57,7 +57,7 @@ def _run_id(run_dir: Path) -> str:
     if not path.exists():
         path.parent.mkdir(exist_ok=True)
         write_atomic(path, secrets.token_hex(4))
-    return path.read_text()
+    return path.read_text(encoding="utf-8")
 
 
 def publish(logger: TolerantLogger | None, results: dict[str, Any], names: tuple[str, ...], run_dir: Path) -> None:

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from utils import flatten
 
-from torchrl_ficreg._utils import lock_file, MOST_JSON_BYTES, read_bytes, write_atomic
+from torchrl_ficreg._utils import lock_folder, MOST_JSON_BYTES, read_bytes, write_atomic
 from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, checkpoints_in, find_checkpoint, read_card
 from torchrl_ficreg.trainers.offline import METRICS
 
@@ -95,7 +95,14 @@ def _read_config(path: Path) -> dict[str, Any]:
 def _from_run_dir(config: dict[str, Any], run_dir: Path) -> dict[str, str]:
     """The way to each place from the run's folder, which stays the same wherever a command is given."""
     places = {key: config[key] for key in _PLACES if config[key] is not None}
-    return {key: os.path.relpath(Path(place).resolve(), run_dir.resolve()) for key, place in places.items()}
+    return {key: _way(Path(place).resolve(), run_dir.resolve()) for key, place in places.items()}
+
+
+def _way(place: Path, start: Path) -> str:
+    try:
+        return os.path.relpath(place, start)
+    except ValueError:  # two drives of Windows
+        return str(place)
 
 
 def _same_places(
@@ -153,7 +160,7 @@ def claim_run_dir(cfg: DictConfig) -> Path:
     run_dir = check_run_dir(cfg)
     run_dir.mkdir(parents=True, exist_ok=True)
     try:  # held, on the folder itself, until this process ends
-        lock_file(os.open(run_dir, os.O_RDONLY), run_dir)
+        lock_folder(run_dir)
     except BlockingIOError as error:
         raise RuntimeError(f"another process is at work in {run_dir}: wait for it, or give another name=...") from error
     settings = OmegaConf.to_container(cfg, resolve=True)

@@ -228,9 +228,6 @@ def _first_batches(dataset, queue):
 
 @pytest.mark.parametrize("prefetch", [None, 2])
 def test_it_continues_in_a_spawned_worker(path, prefetch):
-    # Shared by name: a descriptor may be closed, and its number taken by a pipe, before the process has started.
-    strategy = torch.multiprocessing.get_sharing_strategy()
-    torch.multiprocessing.set_sharing_strategy("file_system")
     dataset = OfflineTrajectories(path, batch_size=7, prefetch=prefetch)
     indices(dataset, 2)
     context = multiprocessing.get_context("spawn")
@@ -239,12 +236,13 @@ def test_it_continues_in_a_spawned_worker(path, prefetch):
     process.start()
     arrived = queue.get(timeout=50)
     process.join()
-    torch.multiprocessing.set_sharing_strategy(strategy)
     assert arrived == (indices(dataset, 3), True, dataset.sample()["action"].sum().item())
 
 
-def test_pickling_carries_no_data(record):
-    dataset = OfflineTrajectories(record([200] * 12), batch_size=7)
+@pytest.mark.parametrize("prefetch", [None, 2])
+def test_pickling_carries_no_data(record, prefetch):
+    """Neither the dataset's nor that of prefetched batches, which are drawn again."""
+    dataset = OfflineTrajectories(record([200] * 12), batch_size=7, prefetch=prefetch)
     dataset.sample()
     assert len(pickle.dumps(dataset)) < 30_000 < dataset._store.arrays["pixels"].nbytes
     assert indices(pickle.loads(pickle.dumps(dataset)), 2) == indices(dataset, 2)

@@ -331,7 +331,7 @@ def write_header(path: Path, header: Header) -> None:
 
 def sync_directory(path: Path) -> None:
     """Makes the names in a directory durable, as ``fsync`` of a file does for its bytes."""
-    if os.name == "nt":  # folders cannot be opened there
+    if not hasattr(os, "O_DIRECTORY"):  # Windows opens no folders
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:

@@ -110,11 +110,11 @@ class SeekableReplayBuffer(TensorDictReplayBuffer):
     def dumps(self, path: str | Path) -> None:
         """Saves :meth:`state_dict` in a directory."""
         Path(path).mkdir(parents=True, exist_ok=True)
-        (Path(path) / _STATE_FILE).write_text(json.dumps(self.state_dict()))
+        (Path(path) / _STATE_FILE).write_text(json.dumps(self.state_dict()), encoding="utf-8")
 
     def loads(self, path: str | Path) -> None:
         """Loads what :meth:`dumps` saved."""
-        self.load_state_dict(json.loads((Path(path) / _STATE_FILE).read_text()))
+        self.load_state_dict(json.loads((Path(path) / _STATE_FILE).read_text(encoding="utf-8")))
 
     def _use_one_reader(self) -> None:
         # TorchRL starts as many threads as batches to prefetch. They take turns at one lock in no fixed order, so
@@ -123,6 +123,12 @@ class SeekableReplayBuffer(TensorDictReplayBuffer):
             self._prefetch_executor.shutdown(wait=False)
             self._prefetch_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="clips")
 
+    def __getstate__(self) -> dict[str, Any]:
+        # TorchRL copies the prefetched batches here. A spawned process would get them by file descriptors, which are
+        # closed with the copies, before it has started; it draws these batches again.
+        return {**super().__getstate__(), "_prefetch_state": None}
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._use_one_reader()
+        self.seek(self._delivered)

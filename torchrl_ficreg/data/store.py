@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from torchrl_ficreg._utils import NO_WAIT
+from torchrl_ficreg._utils import BINARY, NO_WAIT
 from torchrl_ficreg.data.frames import ImageFrames, RawFrames
 from torchrl_ficreg.data.layout import (
     BLOB,
@@ -270,8 +270,10 @@ def _map_rows(path: Path, header: Header, num_steps: int, key: str) -> np.ndarra
 
 def _map_file(file: Path, size: int) -> mmap.mmap:
     """Maps the first ``size`` bytes of a file, copy-on-write."""
-    descriptor = os.open(file, os.O_RDONLY | NO_WAIT)
+    descriptor = os.open(file, os.O_RDONLY | NO_WAIT | BINARY)
     try:
+        if not hasattr(mmap, "MAP_PRIVATE"):  # Windows
+            return mmap.mmap(descriptor, size, access=mmap.ACCESS_COPY)
         flags, protection = mmap.MAP_PRIVATE | _MAP_NORESERVE, mmap.PROT_READ | mmap.PROT_WRITE
         return mmap.mmap(descriptor, size, flags=flags, prot=protection)
     finally:

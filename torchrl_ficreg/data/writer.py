@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_ficreg._utils import lock_file, NO_FOLLOW, read_bytes, require_regular_file, write_all
+from torchrl_ficreg._utils import BINARY, lock_file, NO_FOLLOW, read_bytes, require_regular_file, write_all
 from torchrl_ficreg.data.frames import check_frame_format, encode_frames, FrameFormat
 from torchrl_ficreg.data.layout import (
     BLOB,
@@ -372,7 +372,7 @@ class EpisodeWriter:
         path = self.path / name
         if os.path.lexists(path):
             require_regular_file(path, links=False)
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | NO_FOLLOW, 0o644)
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | NO_FOLLOW | BINARY, 0o644)
 
     def _sizes(self) -> dict[str, int]:
         """Bytes of each data file that belong to committed episodes."""
@@ -388,8 +388,10 @@ class EpisodeWriter:
         already, goes first.
         """
         end = os.fstat(self._index).st_size
-        if end > self._index_bytes and os.pread(self._index, 1, end - 1) == b"\n":
-            os.ftruncate(self._index, end - 1)
+        if end > self._index_bytes:
+            os.lseek(self._index, end - 1, os.SEEK_SET)  # writes go to the end all the same
+            if os.read(self._index, 1) == b"\n":
+                os.ftruncate(self._index, end - 1)
         sizes = self._sizes() if self._header else {}
         for name, descriptor in self._files.items():
             os.ftruncate(descriptor, sizes.get(name, 0))

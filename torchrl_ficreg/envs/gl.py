@@ -85,10 +85,24 @@ def import_simulator(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        raise ImportError(f"{name} is not installed ({error}): pip install 'torchrl_ficreg[envs]'.") from error
+        raise ImportError(f"{name} is not installed ({error}): {how_to_install(name)}.") from error
     except (AttributeError, ImportError, OSError, RuntimeError):  # PyOpenGL trips over a None without its library
         with environment_variables({BACKEND_VARIABLE: _OFF}):
             return importlib.import_module(name)
+
+
+def how_to_install(name: str) -> str:
+    """The command that installs a simulator, for errors.
+
+    Args:
+        name: of its module.
+
+    Examples:
+        >>> how_to_install("mujoco")
+        "pip install 'torchrl_ficreg[envs]'"
+    """
+    late = sys.version_info >= (3, 13) and name.partition(".")[0] in ("dm_control", "ogbench")
+    return "pip install 'torchrl_ficreg[envs]'" + (", with Python 3.12 or older: labmaze has no later wheels" if late else "")
 
 
 def _has_egl() -> bool:

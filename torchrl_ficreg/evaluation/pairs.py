@@ -151,7 +151,7 @@ class StartGoalPairs:
             ValueError: it is not one, or its hash does not fit its content.
         """
         try:
-            content: dict[str, Any] = json.loads(Path(path).read_text())
+            content: dict[str, Any] = json.loads(Path(path).read_text(encoding="utf-8"))
             stored = content.pop("hash")
             arrays = {name: np.array(content.pop(name)) for name in ("episode", "step", "start_state", "goal_state")}
             pairs = cls(**content, **arrays)

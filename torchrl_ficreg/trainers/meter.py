@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import mmap
 import sys
 import time
 from collections.abc import Callable
@@ -74,7 +74,7 @@ def resident_memory() -> int | None:
     """
     statm = Path("/proc/self/statm")
     if statm.exists():
-        return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        return int(statm.read_text(encoding="utf-8").split()[1]) * mmap.PAGESIZE
     try:
         import resource
     except ImportError:  # Windows

@@ -12,8 +12,7 @@ from typing import Any
 
 from torchrl import torchrl_logger
 
-from torchrl_ficreg._utils import NO_FOLLOW, NO_WAIT, read_bytes, write_atomic
-
+from torchrl_ficreg._utils import BINARY, NO_FOLLOW, NO_WAIT, read_bytes, write_all, write_atomic
 
 _STEP = re.compile(r"\d{1,18}", re.ASCII)
 
@@ -123,12 +122,11 @@ def _lines(columns: list[str], rows: list[dict[str, Any]]) -> str:
 
 
 def _append(path: Path, text: str) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | NO_FOLLOW | NO_WAIT)
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | NO_FOLLOW | NO_WAIT | BINARY)
     try:
-        before, data = os.fstat(descriptor).st_size, text.encode()
+        before = os.fstat(descriptor).st_size
         try:
-            while data:
-                data = data[os.write(descriptor, data) :]
+            write_all(descriptor, text.encode())
         except OSError:
             os.ftruncate(descriptor, before)
             raise

@@ -156,7 +156,7 @@ class LeRobotTable(Table):
 def _read_info(path: Path) -> dict[str, Any]:
     check_inside(path / INFO, path)
     try:
-        info = json.loads((path / INFO).read_text())
+        info = json.loads((path / INFO).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path / INFO} is no JSON object ({brief(error)}): fetch the data set again.") from error
     if not isinstance(info, dict):
@@ -172,7 +172,7 @@ def _declared_lengths(path: Path, parquet: Any) -> dict[int, int]:
     lengths: dict[int, int] = {}
     try:
         if (path / "meta/episodes.jsonl").is_file():
-            for line in (path / "meta/episodes.jsonl").read_text().splitlines():
+            for line in (path / "meta/episodes.jsonl").read_text(encoding="utf-8").splitlines():
                 episode = json.loads(line)
                 lengths[int(episode[EPISODE_IDS])] = int(episode["length"])
         for file in sorted((path / "meta/episodes").rglob("[!.]*.parquet")):

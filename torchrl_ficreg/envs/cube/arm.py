@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchrl_ficreg.envs.cube.poses import ARM, CUBE_POSITION, CUBE_ROTATION, NUM_POSITIONS, STATE_SIZE, yaw_rotation
-from torchrl_ficreg.envs.gl import import_mujoco
+from torchrl_ficreg.envs.gl import how_to_install, import_mujoco
 
 if TYPE_CHECKING:
     import mujoco
@@ -43,7 +43,7 @@ def compiled() -> Any:
     try:
         from ogbench.manipspace.envs.cube_env import CubeEnv
     except ImportError as error:
-        raise ImportError(f"ogbench is not installed ({error}): pip install 'torchrl_ficreg[envs]'.") from error
+        raise ImportError(f"ogbench is not installed ({error}): {how_to_install('ogbench')}.") from error
     env = CubeEnv("single", ob_type="states", mode="data_collection", visualize_info=False)
     env.reset(seed=0)  # compiles, and makes the marker of the target transparent
     for material in ("ur5e/robotiq/black", "ur5e/robotiq/pad_gray"):

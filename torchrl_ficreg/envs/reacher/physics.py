@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchrl_ficreg.envs.gl import import_mujoco
+from torchrl_ficreg.envs.gl import how_to_install, import_mujoco
 
 if TYPE_CHECKING:
     import mujoco
@@ -46,7 +46,7 @@ def load_model() -> mujoco.MjModel:
     mujoco = import_mujoco()
     spec = importlib.util.find_spec("dm_control")
     if spec is None or not spec.submodule_search_locations:
-        raise ImportError("dm_control is not installed: pip install 'torchrl_ficreg[envs]'.")
+        raise ImportError(f"dm_control is not installed: {how_to_install('dm_control')}.")
     file = Path(spec.submodule_search_locations[0]) / "suite" / "reacher.xml"
     model = mujoco.MjModel.from_xml_path(str(file))
     model.material("target").rgba[3] = 0.0

@@ -11,7 +11,6 @@ import argparse
 import io
 import json
 import os
-import platform
 import tempfile
 import time
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from torchrl.data import SliceSampler, TensorDictReplayBuffer, TensorStorage
 
 from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, OfflineTrajectories
 from torchrl_ficreg.envs.collect import collect_episodes
+from torchrl_ficreg.modules.precision import describe_processor
 
 RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "clip_sampling.json"
 CLIPS, FRAMES, SKIP, LENGTH = 128, 4, 5, 100
@@ -53,7 +53,7 @@ def main() -> None:
                 results.append({"size": size, "threads": threads, "ways": summarise(table, stored, len(episodes))})
                 show(results[-1])
     header = {"clips": CLIPS, "frames": FRAMES, "frame_skip": SKIP, "repeats": arguments.repeats}
-    machine = {"machine": platform.machine(), "cores": len(os.sched_getaffinity(0)), "torch": torch.__version__}
+    machine = {"machine": describe_processor(), "cores": len(os.sched_getaffinity(0)), "torch": torch.__version__}
     arguments.out.write_text(json.dumps({**header, **machine, "results": results}, indent=2) + "\n")
 
 

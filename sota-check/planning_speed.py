@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +21,7 @@ from torchrl.modules.planners import CEMPlanner
 
 from torchrl_ficreg import LatentCEMPlanner, LatentGoalEnv, LatentWorldModel, make_world_model, ModelConfig, PlanConfig
 from torchrl_ficreg.modules.memory import keep_freed_memory
-from torchrl_ficreg.modules.precision import autocast
+from torchrl_ficreg.modules.precision import autocast, describe_processor
 
 RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "planning_speed.json"
 HORIZON, ACTIONS = 5, 2
@@ -56,7 +55,7 @@ def main() -> None:
         ],
         "profile": profile(model),
         "machine": {
-            "processor": platform.machine(),
+            "processor": describe_processor(),
             "threads": torch.get_num_threads(),
             "torch": torch.__version__,
             "candidates": 300,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import time
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchrl_ficreg import FICRegLoss, make_world_model, ModelConfig, SIGReg
 from torchrl_ficreg.data import OfflineTrajectories
+from torchrl_ficreg.modules.precision import describe_processor
 from torchrl_ficreg.trainers import OfflineTrainer
 
 RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "scaling.json"
@@ -72,7 +72,7 @@ def main() -> None:
         "measured": measured,
         "modelled": {"gpu": GPU, "memory": memory(rows), "runs": runs(measured["presets"])},
         "machine": {
-            "processor": platform.machine(),
+            "processor": describe_processor(),
             "threads": 1,
             "torch": torch.__version__,
             "matrix_operations_per_second": matrix_rate(torch.device("cpu"), size=1024),

@@ -14,7 +14,6 @@ import json
 import math
 import multiprocessing
 import os
-import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,7 +29,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_ficreg import FICRegLoss, make_world_model, ModelConfig
 from torchrl_ficreg.modules.memory import keep_freed_memory
-from torchrl_ficreg.modules.precision import autocast, Precision
+from torchrl_ficreg.modules.precision import autocast, describe_processor, Precision
 
 RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "training_speed.json"
 ACTIONS, FRAMES = 2, 4
@@ -67,7 +66,7 @@ def main() -> None:
         "relative_difference_of_losses": differences(losses),
         "floor": floor(make_way("textbook fp32", clips)),
         "machine": {
-            "processor": platform.machine(),
+            "processor": describe_processor(),
             "threads": torch.get_num_threads(),
             "torch": torch.__version__,
             "clips": clips,

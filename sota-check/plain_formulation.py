@@ -78,9 +78,11 @@ def plain_sigreg(latent: torch.Tensor, directions: torch.Tensor) -> torch.Tensor
 
 
 def plain_encoder(network: nn.Module, pixels: torch.Tensor, mix: Mix) -> torch.Tensor:
-    """The vision transformer as a textbook writes it: [B, T, 3, H, W] uint8 -> [B, T, D]."""
+    """The encoder as a textbook writes it: [B, T, 3, H, W] uint8 -> [B, T, D]."""
     mean, std = (torch.tensor(value).view(3, 1, 1) for value in (IMAGENET_MEAN, IMAGENET_STD))
     frames = (pixels.flatten(0, 1).float() / 255 - mean) / std  # [N, 3, H, W]
+    if hasattr(network, "convolutions"):
+        return plain_convolutions(network, frames).unflatten(0, pixels.shape[:2])
     size = network.patch_size
     kernel = network.to_patch.weight.view(-1, 3, size, size)
     tokens = F.conv2d(frames, kernel, network.to_patch.bias, stride=size).flatten(2).transpose(1, 2)
@@ -92,11 +94,23 @@ def plain_encoder(network: nn.Module, pixels: torch.Tensor, mix: Mix) -> torch.T
     return latent.unflatten(0, pixels.shape[:2])
 
 
+def plain_convolutions(network: nn.Module, frames: torch.Tensor) -> torch.Tensor:
+    """The small encoders: [N, 3, H, W] -> [N, D], in the layout that frames come in."""
+    maps = network.convolutions(frames)
+    if hasattr(network, "projector"):
+        return plain_projector(network.projector, maps.flatten(1))
+    ends = (torch.linspace(-1, 1, size) for size in maps.shape[-2:])
+    grid = torch.stack(torch.meshgrid(*ends, indexing="ij")[::-1], -1).flatten(0, 1)  # [H * W, 2]
+    with torch.autocast("cpu", enabled=False):
+        places = (maps.float().flatten(-2).softmax(-1) @ grid).transpose(-1, -2).flatten(-2)  # [N, 2 K]
+        return F.linear(network.norm(places), network.layer_out.weight, network.layer_out.bias)
+
+
 def plain_predictor(
     network: nn.Module, latent: torch.Tensor, action: torch.Tensor, mix: Mix, *, track: bool = True
 ) -> torch.Tensor:
     """The predictor as a textbook writes it: [B, T, D] and [B, T, F * A] -> [B, T, D]."""
-    x = latent + network.position[:, : latent.shape[1]]
+    x = network.to_width(latent) + network.position[:, : latent.shape[1]]
     embedding = network.action_embedding
     condition = embedding.layer_out(F.silu(embedding.layer_in(embedding.compress(action))))
     for block in network.blocks:

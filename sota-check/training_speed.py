@@ -1,8 +1,9 @@
-"""Seconds per training step of the paper's model, ours beside the plain formulation: docs/results/training_speed.json.
+"""Seconds per training step, ours beside the plain formulation: docs/results/training_speed.json.
 
-All ways train the same weights on the same 8 clips of 4 frames at 224 pixels. Each lives in a process of its own, with
-the allocator's settings its users have, and they take turns within one run, so that a busy machine slows all of them;
-times are the least of the repeats in all rounds, each round with new processes, for memory lies differently in each. "Textbook" computes attention by its formula, "fused" by torch's
+All ways train the same weights on the same clips: 8 of 4 frames at 224 pixels for the paper's model, 128 at 64 pixels for
+the small ones. Each lives in a process of its own, with the allocator's settings its users have, and they take turns
+within one run, so that a busy machine slows all of them; times are the least of the repeats in all rounds, each round
+with new processes, for memory lies differently in each. "Textbook" computes attention by its formula, "fused" by torch's
 ``scaled_dot_product_attention``; the rest of the four plain ways is the same.
 """
 
@@ -32,7 +33,12 @@ from torchrl_ficreg.modules.memory import keep_freed_memory
 from torchrl_ficreg.modules.precision import autocast, describe_processor, Precision
 
 RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "training_speed.json"
-ACTIONS, FRAMES = 2, 4
+ACTIONS = 2
+MODELS = {
+    "paper": ModelConfig.preset("paper", predictor_attention_dropout=0.0),
+    "conv": ModelConfig.preset("cpu"),
+    "keypoint": ModelConfig.preset("cpu", encoder="keypoint", history=3),
+}
 KEPT = 2**31 - 1  # bytes, as OfflineTrainer keeps
 Terms = dict[str, torch.Tensor]
 PLAIN: dict[str, tuple[Mix, Precision]] = {
@@ -46,17 +52,20 @@ PLAIN: dict[str, tuple[Mix, Precision]] = {
 def main() -> None:
     """Measures, prints and writes."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--clips", type=int, default=8)
+    parser.add_argument("--model", choices=MODELS, default="paper")
+    parser.add_argument("--clips", type=int, help="default: 8, of the small models 128")
     parser.add_argument("--repeats", type=int, default=6, help="steps in each round")
     parser.add_argument("--rounds", type=int, default=3, help="of new processes")
     parser.add_argument("--quick", action="store_true", help="two clips, one repeat, to see it run; writes no default file")
     parser.add_argument("--profile", action="store_true", help="only print where the time of our step goes")
     parser.add_argument("--out", type=Path, help=f"default: {RESULT}")
     arguments = parser.parse_args()
-    clips, repeats, rounds = (2, 1, 1) if arguments.quick else (arguments.clips, arguments.repeats, arguments.rounds)
+    clips, repeats, rounds = arguments.clips or (8 if arguments.model == "paper" else 128), arguments.repeats, arguments.rounds
+    if arguments.quick:
+        clips, repeats, rounds = 2, 1, 1
     if arguments.profile:
-        return profile(make_way("ours", clips))
-    losses, seconds, cpu_seconds = measure(("ours", *PLAIN), clips, repeats, rounds)
+        return profile(make_way("ours", arguments.model, clips))
+    losses, seconds, cpu_seconds = measure(("ours", *PLAIN), arguments.model, clips, repeats, rounds)
     results = {
         "seconds_per_step": seconds,
         "cpu_seconds_per_step": cpu_seconds,
@@ -64,13 +73,14 @@ def main() -> None:
         "cpu_speedup": ratios(cpu_seconds),
         "losses": losses,
         "relative_difference_of_losses": differences(losses),
-        "floor": floor(make_way("textbook fp32", clips)),
+        "floor": floor(make_way("textbook fp32", arguments.model, clips)),
         "machine": {
             "processor": describe_processor(),
             "threads": torch.get_num_threads(),
             "torch": torch.__version__,
+            "model": arguments.model,
             "clips": clips,
-            "frames": FRAMES,
+            "frames": MODELS[arguments.model].history + 1,
             "repeats": repeats,
             "rounds": rounds,
         },
@@ -126,9 +136,9 @@ class Way:
         return {**{key: value.item() for key, value in terms.items()}, "sum": total.item(), "grad_norm": norm.item()}
 
 
-def make_way(name: str, clips: int) -> Way:
+def make_way(name: str, model: str, clips: int) -> Way:
     """The way of that name, from the starting point they share."""
-    start, clip = starting_point(), random_clips(clips)
+    start, clip = starting_point(MODELS[model]), random_clips(MODELS[model], clips)
     if name == "ours":
         keep_freed_memory(KEPT)
         return Way(start, clip, our_terms, "auto", fused=True)
@@ -136,22 +146,23 @@ def make_way(name: str, clips: int) -> Way:
     return Way(start, clip, partial(plain_terms, mix=mix), precision, fused=False)
 
 
-def starting_point() -> FICRegLoss:
+def starting_point(config: ModelConfig) -> FICRegLoss:
     """The loss with all its weights. The action modulation is moved off its start at zero, as training does."""
     torch.manual_seed(0)
-    model, inverse_model = make_world_model(ModelConfig.preset("paper", predictor_attention_dropout=0.0), ACTIONS)
+    model, inverse_model = make_world_model(config, ACTIONS)
     with torch.no_grad():
         for block in model.predictor.module.blocks:
             block.to_modulation.weight.normal_(std=0.02)
     return FICRegLoss(model.encoder, model.predictor, inverse_model)
 
 
-def random_clips(clips: int) -> TensorDict:
-    """Clips of noise: ``pixels`` [B, T, 3, 224, 224] uint8 and ``action`` [B, T, F * A]."""
+def random_clips(config: ModelConfig, clips: int) -> TensorDict:
+    """Clips of noise: ``pixels`` [B, T, 3, H, W] uint8 and ``action`` [B, T, F * A]."""
     generator = torch.Generator().manual_seed(0)
-    pixels = torch.randint(0, 256, (clips, FRAMES, 3, 224, 224), dtype=torch.uint8, generator=generator)
-    action = torch.randn(clips, FRAMES, 5 * ACTIONS, generator=generator)
-    return TensorDict({"pixels": pixels, "action": action}, [clips, FRAMES])
+    lead, size = (clips, config.history + 1), config.image_size
+    pixels = torch.randint(0, 256, (*lead, 3, size, size), dtype=torch.uint8, generator=generator)
+    action = torch.randn(*lead, 5 * ACTIONS, generator=generator)
+    return TensorDict({"pixels": pixels, "action": action}, lead)
 
 
 def our_terms(loss: FICRegLoss, clip: TensorDictBase) -> Terms:
@@ -159,11 +170,11 @@ def our_terms(loss: FICRegLoss, clip: TensorDictBase) -> Terms:
     return dict(loss(clip).items())
 
 
-def measure(names: tuple[str, ...], clips: int, repeats: int, rounds: int) -> tuple[dict, dict, dict]:
+def measure(names: tuple[str, ...], model: str, clips: int, repeats: int, rounds: int) -> tuple[dict, dict, dict]:
     """Of each way: its losses, and the least wall and processor seconds of a step."""
     losses, wall, cpu = {}, *(dict.fromkeys(names, math.inf) for _ in range(2))
     for _ in range(rounds):
-        with ways(names, clips) as pipes:
+        with ways(names, model, clips) as pipes:
             losses = losses or {name: ask(pipe, "compare") for name, pipe in pipes.items()}  # the same in every round
             for repeat in range(-3, repeats):  # kernels choose their blocking at first, then allocators settle
                 for name, pipe in pipes.items():
@@ -174,12 +185,12 @@ def measure(names: tuple[str, ...], clips: int, repeats: int, rounds: int) -> tu
 
 
 @contextmanager
-def ways(names: tuple[str, ...], clips: int) -> Iterator[dict[str, Connection]]:
+def ways(names: tuple[str, ...], model: str, clips: int) -> Iterator[dict[str, Connection]]:
     """A process for each way, and the pipe that leads to it."""
     context, pipes, workers = multiprocessing.get_context("spawn"), {}, []
     for name in names:
         pipes[name], other = context.Pipe()
-        workers.append(context.Process(target=serve, args=(other, name, clips), daemon=True))
+        workers.append(context.Process(target=serve, args=(other, name, model, clips), daemon=True))
         os.environ["THP_MEM_ALLOC_ENABLE"] = "1" if name == "ours" else "0"  # as train.py sets it, and torch's default
         workers[-1].start()
         other.close()
@@ -189,9 +200,9 @@ def ways(names: tuple[str, ...], clips: int) -> Iterator[dict[str, Connection]]:
         worker.join()
 
 
-def serve(pipe: Connection, name: str, clips: int) -> None:
+def serve(pipe: Connection, name: str, model: str, clips: int) -> None:
     """Calls the methods of one way, by name, until asked for None."""
-    way = make_way(name, clips)
+    way = make_way(name, model, clips)
     for method in iter(pipe.recv, None):
         pipe.send(getattr(way, method)())
 

@@ -31,10 +31,11 @@ from utils import (
 
 from torchrl_ficreg._utils import read_json, write_atomic
 from torchrl_ficreg.evaluation import save_episodes_gif, StartGoalPairs
+from torchrl_ficreg.modules.safe_files import checksum_of
 from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_model
 
 RESULTS = "results.json"
-SHARED = ("checkpoint", "pairs", "budget")  # settings besides the plan
+SHARED = ("checkpoint", "weights", "pairs", "budget")  # settings besides the plan
 LARGEST = 10**6  # of a count in a plan, and of a budget: more is a damaged or hostile card, or a slip
 
 
@@ -74,6 +75,8 @@ def evaluate(cfg: DictConfig) -> None:
     policy = make_policy(plan, model.to(device), inverse_model.to(device), bounds, run_dir)
     settings = {
         "checkpoint": checkpoint.name,
+        "weights": checksum_of(model.state_dict())[:8],
+        "env_kwargs": card.env_kwargs,
         "pairs": pairs.hash,
         "budget": budget,
         "plan": OmegaConf.to_container(plan),
@@ -163,7 +166,7 @@ def check_results(results: Any) -> dict[str, Any]:
     for number in (*numbers, low, high, 0 if unsolved is None else unsolved):
         if isinstance(number, bool) or not isinstance(number, (int, float)) or not math.isfinite(number):
             raise ValueError(f"{str(number)[:40]!r} is no number")
-    [results[key] for key in SHARED]
+    [results[key] for key in SHARED if key != "weights"]  # which older ones lack
     flatten({"plan": {**results["plan"]}})
     if not row_name(results).isprintable() or len(row_name(results)) > 80:
         raise ValueError("method and search are no names")
@@ -178,7 +181,7 @@ def row_name(results: dict[str, Any]) -> str:
 def show(evaluations: dict[str, dict[str, Any]]) -> None:
     """Prints a table over evaluations, by the names of their folders; the first is the one just made."""
     flat = {
-        name: {**{key: results[key] for key in SHARED}, **flatten(results["plan"], "plan.")}
+        name: {**{key: results.get(key) for key in SHARED}, **flatten(results["plan"], "plan.")}
         for name, results in evaluations.items()
     }
     keys = dict.fromkeys(key for settings in flat.values() for key in settings if key != "plan.search")

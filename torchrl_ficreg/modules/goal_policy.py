@@ -18,6 +18,7 @@ from torchrl_ficreg.modules.safe_files import (
     check_shapes,
     check_sizes,
     CHECKSUM,
+    checksum_of,
     config_file,
     json_text,
     read_config,
@@ -266,9 +267,4 @@ def load_goal_policy(
 
 def _checksum(world_model: LatentWorldModel) -> str:
     """Changes with any weight of the encoder and with the action statistics: all that a policy's numbers refer to."""
-    state = {**world_model.encoder.state_dict(), **dict(world_model.named_buffers(recurse=False))}
-    digest = hashlib.sha256()
-    for name in sorted(state):
-        digest.update(name.encode())
-        digest.update(state[name].detach().float().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
+    return checksum_of({**world_model.encoder.state_dict(), **dict(world_model.named_buffers(recurse=False))})

@@ -249,6 +249,15 @@ def state_of(parts: Mapping[str, nn.Module]) -> dict[str, torch.Tensor]:
     return {f"{part}.{name}": value for part, module in parts.items() for name, value in module.state_dict().items()}
 
 
+def checksum_of(state: Mapping[str, torch.Tensor]) -> str:
+    """SHA-256 of a state's names and float32 values, as hexadecimal digits; of any device."""
+    digest = hashlib.sha256()
+    for name in sorted(state):
+        digest.update(name.encode())
+        digest.update(state[name].detach().float().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
 def as_float32(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Copies on the CPU, contiguous, floating numbers in float32."""
     return {

@@ -10,6 +10,8 @@ from torchrl.modules.planners import MPCPlannerBase
 
 from torchrl_ficreg import GoalDistance, LatentCEMPlanner, PlanConfig
 
+pytestmark = pytest.mark.usefixtures("fast_bf16")
+
 SEARCH = {"num_candidates": 64, "num_elites": 8, "iterations": 20, "horizon": 3, "receding_horizon": 1}
 FAST = {**SEARCH, "num_candidates": 16, "num_elites": 4, "iterations": 3, "precision": "fp32"}
 UNIT = ([-1.0, -1.0], [1.0, 1.0])

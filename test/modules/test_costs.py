@@ -22,6 +22,8 @@ from torchrl_ficreg import (
     PlanConfig,
 )
 
+pytestmark = pytest.mark.usefixtures("fast_bf16")
+
 UNIT = ([-1.0, -1.0], [1.0, 1.0])
 FAST = {"num_candidates": 32, "num_elites": 6, "iterations": 5, "horizon": 3, "receding_horizon": 1}
 FAST |= {"precision": "fp32"}

@@ -11,6 +11,8 @@ from torchrl_ficreg.modules.planners import SEARCHES
 from torchrl_ficreg.modules.planners.icem import coloured
 from torchrl_ficreg.modules.planners.problem import Problem
 
+pytestmark = pytest.mark.usefixtures("fast_bf16")
+
 UNIT = ([-1.0, -1.0], [1.0, 1.0])
 SIZES = {"num_candidates": 40, "num_elites": 8, "iterations": 5, "horizon": 3, "receding_horizon": 1}
 SIZES |= {"precision": "fp32"}

@@ -23,6 +23,8 @@ from torchrl_ficreg import (
 from torchrl_ficreg.envs import make_env
 from torchrl_ficreg.modules.planners import SEARCHES
 
+pytestmark = pytest.mark.usefixtures("fast_bf16")
+
 SIZES = {"num_candidates": 8, "num_elites": 2, "iterations": 2, "horizon": 3, "precision": "fp32"}
 UNIT = ([-1.0, -1.0], [1.0, 1.0])
 

@@ -10,6 +10,8 @@ from torchrl_ficreg import LatentPlanner, MPCPolicy, PlanConfig
 from torchrl_ficreg.data import ActionStatistics
 from torchrl_ficreg.modules.planners import SEARCHES
 
+pytestmark = pytest.mark.usefixtures("fast_bf16")
+
 UNIT = ([-1.0, -1.0], [1.0, 1.0])
 SIZES = {"num_candidates": 16, "num_elites": 4, "iterations": 2, "horizon": 3, "precision": "fp32"}
 STEPS = 2  # raw actions in a block of the tiny world

@@ -16,6 +16,8 @@ from torchrl_ficreg import ActionEffort, CostSum, GoalDistance, GoalPolicy, Late
 from torchrl_ficreg.data import ActionStatistics
 from torchrl_ficreg.modules.planners import SEARCHES
 
+pytestmark = pytest.mark.usefixtures("fast_bf16")
+
 UNIT = ([-1.0, -1.0], [1.0, 1.0])
 EFFORT, HORIZON = 8.0, 4
 SEARCHING = [name for name in SEARCHES if name != "policy"]

@@ -126,7 +126,7 @@ def test_planners_and_costs_feed_by_name_too(networks, latent_key):
         torch.manual_seed(0)
         path, block = torch.randn(2, 3, 2, 6), torch.randn(2, 3, 2, 6)
         cost = InverseConsistency(judge)(path, goal, block, latent)
-        planner = LatentCEMPlanner(model.eval(), PlanConfig(num_candidates=8, num_elites=2, iterations=2, bounds="none"))
+        planner = LatentCEMPlanner(model.eval(), PlanConfig(num_candidates=8, num_elites=2, iterations=2, bounds="none", precision="fp32"))
         plans.append((model.predict(path, block), model.rollout(path, block), cost, planner.plan(latent, goal)["plan"]))
     for one, other in zip(*plans, strict=True):
         torch.testing.assert_close(other, one)

@@ -11,10 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 from omegaconf import OmegaConf
 
-from torchrl_ficreg import GoalPolicy
+from torchrl_ficreg import GoalPolicy, InverseDynamicsModel
 from torchrl_ficreg.modules.goal_policy import save_goal_policy
 from torchrl_ficreg.trainers import load_world_model
 
@@ -135,7 +134,7 @@ def test_training_refuses_a_horizon_beyond_the_budget_before_it_begins(modules, 
 def test_terms_without_weight_are_not_computed(modules):
     """The judge is asked only where its doubts count."""
     planning = modules("planning")
-    judge = torch.nn.Linear(2, 2)
+    judge = InverseDynamicsModel(2, 2, 4)
     plan = OmegaConf.create({"cost": "path", "effort": 0.0, "consistency": 0.0})
     assert type(planning.make_cost(plan, judge)).__name__ == "PathDistance"
     plan.effort = 0.3

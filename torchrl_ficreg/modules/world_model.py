@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_ficreg.data.schema import ACTION, LATENT, PIXELS, PREDICTED_LATENT
 from torchrl_ficreg.data.statistics import ActionStatistics
-from torchrl_ficreg.modules.feed import arrange, choose_output, feed, Names, read_output
+from torchrl_ficreg.modules.feed import arrange, choose_output, feed, Names, read_output, require_module
 from torchrl_ficreg.modules.pixels import check_finite
 from torchrl_ficreg.modules.predictor import CausalPredictor
 
@@ -45,6 +45,8 @@ class LatentWorldModel(TensorDictModuleBase):
         statistics: ActionStatistics | None = None,
     ) -> None:
         super().__init__()
+        for name, module in (("encoder", encoder), ("predictor", predictor)):
+            require_module(name, module)
         arrange("predictor", predictor.in_keys, self._names(encoder))
         block = predictor.module.action_dim
         if block % frame_skip:

@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torchrl_ficreg.data.schema import LATENT, RECOVERED_ACTION
-from torchrl_ficreg.modules.feed import arrange, feed, NEXT_LATENT, read_output
+from torchrl_ficreg.modules.feed import arrange, feed, NEXT_LATENT, read_output, require_module
 
 Cost = Callable[..., torch.Tensor]
 
@@ -105,6 +105,7 @@ class InverseConsistency(nn.Module):
 
     def __init__(self, inverse_model: TensorDictModuleBase) -> None:
         super().__init__()
+        require_module("inverse_model", inverse_model)
         arrange("inverse_model", inverse_model.in_keys, {LATENT: (), NEXT_LATENT: ()})
         self.inverse_model = inverse_model
 

@@ -22,7 +22,15 @@ Cost = Callable[..., torch.Tensor]
 
 
 def wanted_by(cost: Cost) -> tuple[str, ...]:
-    """Which of ``action`` and ``start`` a cost names."""
+    """Which of ``action`` and ``start`` a cost names.
+
+    Raises:
+        TypeError: it cannot be called, or is a class in place of an instance of it.
+    """
+    if isinstance(cost, type) or not callable(cost):
+        raise TypeError(
+            f"a cost is a module or function (predicted, goal) -> [E, K], such as GoalDistance(), got {cost!r}."
+        )
     parameters = inspect.signature(cost.forward if isinstance(cost, nn.Module) else cost).parameters
     takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
     return tuple(name for name in ("action", "start") if takes_all or name in parameters)

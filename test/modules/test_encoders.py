@@ -49,6 +49,28 @@ def test_leading_dimensions_are_frames(encoder, lead):
     torch.testing.assert_close(latent.reshape(-1, 6), encoder(pixels=pixels.reshape(-1, 3, 16, 16)))
 
 
+@pytest.mark.parametrize("default", [torch.float64, torch.bfloat16])
+def test_the_default_dtype_of_a_script_decides_when_an_encoder_is_built_only(build, encoder, default):
+    """Not what it computes in later."""
+    pixels, before = frames(5), torch.get_default_dtype()
+    expected = encoder(pixels=pixels)
+    torch.set_default_dtype(default)
+    try:
+        assert encoder(pixels=pixels).equal(expected)
+        assert build()(pixels=pixels).dtype == default
+    finally:
+        torch.set_default_dtype(before)
+    torch.testing.assert_close(encoder.double()(pixels=pixels).float(), expected)
+
+
+def test_every_pixel_has_a_gradient_under_torch_func(encoder):
+    """Frame by frame, as for a map of what an encoder looks at."""
+    pixels = torch.rand(4, 3, 16, 16, requires_grad=True)
+    (expected,) = torch.autograd.grad(encoder(pixels=pixels).sum(), pixels)
+    found = torch.vmap(torch.func.grad(lambda frame: encoder.module(frame).sum()))(pixels)
+    torch.testing.assert_close(found, expected)
+
+
 def test_a_frame_is_encoded_as_if_alone(encoder):
     pixels = frames(4)
     alone = torch.cat([encoder(pixels=frame[None]) for frame in pixels])

@@ -82,6 +82,41 @@ def test_without_many_rows_autocast_or_gradients_a_linear_layer_is_torchs_own(re
         assert layer(x).equal(F.linear(x, layer.weight, layer.bias))
 
 
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("dtype", [None, torch.bfloat16])
+def test_a_vision_transformer_compiles_into_one_graph_for_many_rows(training, dtype):
+    """No question about the processor is asked while the compiler traces."""
+    encoder = ViTEncoder(image_size=16, patch_size=4, width=12, depth=2, heads=3, mlp_dim=16, projector_dim=12).train(training)
+    pixels = torch.randint(0, 256, (kernels.MANY // 16, 3, 16, 16), dtype=torch.uint8)
+    with torch.autocast("cpu", dtype, enabled=dtype is not None):
+        latent = torch.compile(encoder.module, backend="eager", fullgraph=True)(pixels)
+        assert latent.shape == (len(pixels), 192) and latent.isfinite().all()
+
+
+@pytest.mark.parametrize("amx", [True, False])
+@pytest.mark.parametrize("dtype", [None, torch.bfloat16])
+def test_transforms_of_torch_func_see_through_a_vision_transformer(monkeypatch, amx, dtype):
+    """``vmap`` is the loop over its dimension; per-sample gradients add up to the gradient of the batch."""
+    monkeypatch.setattr(kernels, "has_amx", lambda: amx)
+    monkeypatch.setattr(kernels, "MANY", 1)
+    block = Block(12, 3, 16)
+    x, params = torch.randn(5, 4, 12), dict(block.named_parameters())
+
+    def objective(params, x):
+        return torch.func.functional_call(block, params, (x,)).float().square().sum()
+
+    with torch.autocast("cpu", dtype, enabled=dtype is not None):
+        expected = torch.func.grad(objective)(params, x)
+        found = torch.vmap(torch.func.grad(objective), (None, 0))(params, x.unsqueeze(1))
+        mapped = torch.vmap(block)(x.unsqueeze(1)).squeeze(1)
+        whole = block(x)
+    tolerance = 1e-5 if dtype is None else 5e-2
+    for name, gradient in expected.items():
+        scale = gradient.abs().max().item()
+        torch.testing.assert_close(found[name].sum(0), gradient, rtol=0, atol=tolerance * max(scale, 1))
+    torch.testing.assert_close(mapped, whole, rtol=0, atol=tolerance * whole.abs().max().item())
+
+
 def test_the_first_token_of_a_block_costs_less_and_is_the_same():
     """In value, and in every gradient."""
     block = Block(12, 3, 16).double()

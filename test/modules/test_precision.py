@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 from torch import nn
+from torch._subclasses import FakeTensorMode
 
 from torchrl_ficreg import ConvEncoder, KeypointEncoder, ViTEncoder
 from torchrl_ficreg.modules import precision
@@ -26,14 +28,61 @@ def speeds(monkeypatch):
     return pretend
 
 
+@pytest.fixture
+def unmeasured(monkeypatch):
+    """As in a process that has measured nothing yet."""
+    monkeypatch.setattr(precision, "_speedups", {})
+
+
 @pytest.mark.parametrize("kind", ["products", "convolutions"])
-def test_the_speed_of_bfloat16_is_measured_once_and_leaves_no_trace(kind):
+def test_the_speed_of_bfloat16_is_measured_once_and_leaves_no_trace(unmeasured, kind):
     state, threads = torch.get_rng_state(), torch.get_num_threads()
-    bf16_speedup.cache_clear() if hasattr(bf16_speedup, "cache_clear") else None
     with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
         measured = bf16_speedup(kind)
     assert 0 < measured < 1000 and bf16_speedup(kind) == measured
     assert torch.get_rng_state().equal(state) and torch.get_num_threads() == threads
+
+
+def run_compiled(ask):
+    torch.compile(lambda x: x * ask(), backend="eager", fullgraph=True)(torch.ones(2))
+
+
+def run_fake(ask):
+    with FakeTensorMode():
+        ask()
+
+
+CONTEXTS = {
+    "torch.compile": run_compiled,
+    "torch.vmap": lambda ask: torch.vmap(lambda x: x * ask())(torch.ones(2)),
+    "torch.func.grad": lambda ask: torch.func.grad(lambda x: x * ask())(torch.ones(())),
+    "fake tensors": run_fake,
+    "torch.jit.trace": lambda ask: torch.jit.trace(lambda x: x * ask(), torch.ones(2)),
+}
+
+
+@pytest.mark.parametrize("kind", ["products", "convolutions"])
+@pytest.mark.parametrize("context", CONTEXTS)
+def test_it_can_be_measured_first_wherever_it_is_asked_for(unmeasured, monkeypatch, context, kind):
+    """On real tensors, whatever the tensors of the caller are."""
+    measure, seen = precision._measure, []
+
+    def watched(kind):
+        seen.append(type(torch.ones(2)) is torch.Tensor and not torch._C._are_functorch_transforms_active())
+        return measure(kind)
+
+    monkeypatch.setattr(precision, "_measure", watched)
+    CONTEXTS[context](lambda: bf16_speedup(kind))
+    assert seen == [True] and bf16_speedup(kind) > 0 and seen == [True]
+
+
+def test_threads_that_ask_together_wait_for_one_measurement(unmeasured):
+    """And a thread that starts later has as many threads to compute with as before."""
+    threads = torch.get_num_threads()
+    with ThreadPoolExecutor(4) as pool:
+        assert len(set(pool.map(lambda _: bf16_speedup(), range(4)))) == 1
+    with ThreadPoolExecutor(1) as later:
+        assert later.submit(torch.get_num_threads).result() == threads
 
 
 def test_instructions_that_are_switched_off_are_noticed():

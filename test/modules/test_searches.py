@@ -45,6 +45,59 @@ def policy():
     return GoalPolicy(latent_dim=6, action_dim=4, hidden_dim=16, depth=2).eval()
 
 
+@pytest.mark.parametrize("default", [torch.float64, torch.bfloat16])
+@pytest.mark.parametrize("search", SEARCHING)
+def test_the_default_dtype_of_a_script_changes_no_plan(tiny_world, search, default):
+    world, latent, goal = tiny_world(), torch.randn(2, 6), torch.randn(2, 6)
+    expected = make(search, world).plan(latent, goal)
+    torch.set_default_dtype(default)
+    try:
+        found = make(search, world).plan(latent, goal)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    torch.testing.assert_close(found.to_dict(), expected.to_dict(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("search", SEARCHING)
+def test_the_default_device_of_a_script_changes_no_plan(tiny_world, search):
+    """With the model elsewhere: meta, in place of a GPU, has no numbers to plan with."""
+    world, latent, goal = tiny_world(), torch.randn(2, 6), torch.randn(2, 6)
+    expected = make(search, world).plan(latent, goal)
+    with torch.device("meta"):
+        found = make(search, world).plan(latent, goal)
+    torch.testing.assert_close(found.to_dict(), expected.to_dict(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("search", SEARCHING)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+def test_a_cost_gets_tensors_of_one_dtype_and_says_its_value_in_it(tiny_world, search, dtype):
+    """float64 for float64 latents, else float32."""
+    seen = set()
+
+    def cost(predicted, goal, action, start):
+        seen.update(tensor.dtype for tensor in (predicted, goal, action, start))
+        return torch.einsum("ektd,ed->ek", predicted, goal - start) + action.sum((-1, -2))
+
+    world, latent, goal = tiny_world().to(dtype), torch.randn(2, 6).to(dtype), torch.randn(2, 6).to(dtype)
+    result = make(search, world, cost=cost, precision="auto").plan(latent, goal)
+    assert seen == {result["plan_cost"].dtype} == {torch.promote_types(dtype, torch.float32)}
+    assert result["plan"].dtype == dtype
+
+
+@pytest.mark.parametrize("cost", [GoalDistance, 3.0])
+def test_what_is_no_cost_is_refused(tiny_world, cost):
+    with pytest.raises(TypeError, match="a cost is a module or function .predicted, goal. -> .E, K., such as"):
+        make("cem", tiny_world(), cost=cost)
+
+
+def test_costs_without_a_shape_or_a_gradient_are_refused(tiny_world):
+    latent, goal = torch.zeros(2, 6), torch.ones(2, 6)
+    with pytest.raises(ValueError, match=r"to \[E, K\] = \[1, 24\], function returned float"):
+        make("cem", tiny_world(), cost=lambda predicted, goal: 3.0).plan(latent, goal)
+    with pytest.raises(ValueError, match="the cost has no gradient with respect to the actions"):
+        make("gradient", tiny_world(), cost=lambda predicted, goal: predicted.detach().mean((-1, -2))).plan(latent, goal)
+
+
 # Known optima
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
 
-from torchrl_ficreg import CausalPredictor, ConvEncoder, LatentWorldModel
+from torchrl_ficreg import CausalPredictor, ConvEncoder, LatentCEMPlanner, LatentWorldModel, PlanConfig
 from torchrl_ficreg.data import ActionStatistics
 
 
@@ -35,6 +37,70 @@ def test_the_first_imagined_step_is_the_prediction_trained_for(tiny_world):
     model = tiny_world()
     latent, action = torch.randn(2, 3, 6), torch.randn(2, 3, 4)
     torch.testing.assert_close(model.rollout(latent, action)[:, 0], model.predict(latent, action)[:, -1])
+
+
+class Own(nn.Module):
+    """A predictor with a constant of its own in float32, which no cast of its parameters reaches."""
+
+    def __init__(self, **sizes):
+        super().__init__()
+        self.layer = nn.Linear(10, 6)
+        vars(self).update(sizes)
+
+    def forward(self, latent, action):
+        return self.layer(torch.cat([latent + torch.linspace(0, 1, 6, dtype=torch.float32), action], -1))
+
+
+SIZES = {"history": 2, "latent_dim": 6, "action_dim": 4}
+
+
+def with_predictor(predictor, **kwargs):
+    encoder = TensorDictModule(nn.Identity(), ["pixels"], ["latent"])
+    return LatentWorldModel(encoder, predictor, **{"frame_skip": 2, **kwargs}).eval()
+
+
+def test_a_predictor_of_ones_own_says_its_sizes_itself_or_in_its_network():
+    """In a single module or in a sequence of them; the rollout is the same."""
+    network = Own(**SIZES)
+    single = with_predictor(TensorDictModule(network, ["latent", "action"], ["predicted_latent"]))
+    sequence = TensorDictSequential(TensorDictModule(network, ["latent", "action"], ["predicted_latent"]))
+    vars(sequence).update(SIZES)
+    latent, action = torch.randn(3, 1, 6), torch.randn(3, 4, 4)
+    expected = single.rollout(latent, action)
+    assert with_predictor(sequence).rollout(latent, action).equal(expected)
+    torch.testing.assert_close(expected, by_hand(single, latent, action))
+
+
+@pytest.mark.parametrize("missing", SIZES)
+def test_a_predictor_without_sizes_is_told_which(missing):
+    network = Own(**{name: size for name, size in SIZES.items() if name != missing})
+    with pytest.raises(TypeError, match=f"a predictor of your own says .*: give it, or its network, {missing}"):
+        with_predictor(TensorDictModule(network, ["latent", "action"], ["predicted_latent"]))
+
+
+def test_a_plain_module_and_a_frame_skip_that_is_none_are_refused():
+    with pytest.raises(TypeError, match="the predictor must be a TensorDictModule, got a Own: wrap a network as"):
+        with_predictor(Own(**SIZES))
+    predictor = TensorDictModule(Own(**SIZES), ["latent", "action"], ["predicted_latent"])
+    for wrong in (0, -2, 2.0):
+        with pytest.raises(ValueError, match="frame_skip must be a whole number of at least 1 action, got"):
+            with_predictor(predictor, frame_skip=wrong)
+
+
+def test_left_to_choose_a_planner_does_not_cast_a_network_of_ones_own(monkeypatch):
+    """Wherever bfloat16 is fast: it may not bear the rounding, or, as here, the cast. A network of the package does."""
+    monkeypatch.setattr("torchrl_ficreg.modules.planners.common.uses_bf16", lambda device, chosen: chosen != "fp32")
+    settings = {"num_candidates": 8, "num_elites": 2, "iterations": 2}
+    model = with_predictor(TensorDictModule(Own(**SIZES), ["latent", "action"], ["predicted_latent"]))
+    plans = [
+        LatentCEMPlanner(model, PlanConfig(**settings, precision=precision), action_bounds=([-1, -1], [1, 1])).plan(
+            torch.zeros(2, 6), torch.ones(2, 6)
+        )
+        for precision in ("auto", "fp32")
+    ]
+    assert plans[0]["plan"].equal(plans[1]["plan"])
+    predictor = CausalPredictor(latent_dim=6, action_dim=4, history=1, depth=1)
+    assert LatentCEMPlanner(with_predictor(predictor), PlanConfig(bounds="none"))._wants_bf16_copy()
 
 
 def test_a_rollout_is_differentiable_in_its_actions(tiny_world):

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
+from torch._subclasses import FakeTensor, FakeTensorMode
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
 from torchrl_ficreg import (
@@ -393,6 +394,23 @@ def test_a_slice_sampler_feeds_a_loss(make_loss, make_clip):
     assert all(param.grad is not None for param in loss.parameters())
 
 
+def test_clips_that_go_on_after_an_end_are_refused(make_loss, make_clip):
+    """Slices of another length than ``num_frames``, and batches of a collector, say so in ("next", "done")."""
+    clip = make_clip(8, frames=3)
+    clip["next", "done"] = torch.zeros(8, 3, 1, dtype=torch.bool)
+    clip["next", "done"][:, -1] = True
+    make_loss("lewm", num_frames=3)(clip.reshape(24))
+    with pytest.raises(ValueError, match="4 transitions lead past .*'done'.* into another trajectory: give the loss"):
+        make_loss("lewm", num_frames=6)(clip.reshape(24))
+    clip["next", "done"][0, 0] = True
+    with pytest.raises(ValueError, match="1 transitions lead past"):
+        make_loss("lewm")(clip)
+    clip["mask"] = ~clip["next", "done"]
+    make_loss("lewm")(clip)
+    with pytest.raises(KeyError, match="the clip has no 'action'"):
+        make_loss("lewm")(clip.exclude("action"))
+
+
 def test_transitions_are_clips_of_two_frames(loss, make_clip):
     """[B] and [B, 1] with ("next", "pixels"), masked too; a whole clip is read as before, whatever lies beside it."""
     clip = make_clip(frames=2)
@@ -495,6 +513,42 @@ def test_networks_of_another_dtype_take_the_clips_as_they_are(loss, make_clip, d
     sum(output.values()).backward()
 
 
+def test_networks_without_parameters_take_actions_of_any_dtype(make_clip):
+    encoder = TensorDictModule(lambda pixels: pixels.flatten(-3)[..., :6] / 255, ["pixels"], ["latent"])
+    predictor = TensorDictModule(lambda latent, action: latent + action, ["latent", "action"], ["predicted_latent"])
+    clip = make_clip()
+    clip["action"] = clip["action"].double()
+    assert LeWMLoss(encoder, predictor)(clip)["loss_pred"].isfinite()
+
+
+@pytest.mark.parametrize("floats", [True, False])
+@pytest.mark.parametrize("name", ["lewm", "paper", "joint", "pldm"])
+def test_a_loss_runs_on_fake_tensors(make_loss, make_clip, name, floats):
+    """Which have a device, and no value that could be looked at."""
+    loss, mode = make_loss(name), FakeTensorMode(allow_non_fake_inputs=True)
+    clip = make_clip().set("mask", torch.ones(8, 3, dtype=torch.bool))
+    clip["pixels"] = clip["pixels"] / 255 if floats else clip["pixels"]
+    with mode:
+        output = loss(clip.apply(mode.from_tensor))
+        assert all(isinstance(value, FakeTensor) and value.shape == () for value in output.values())
+
+
+def test_torch_func_differentiates_a_loss_by_its_parameters(make_loss, make_clip):
+    """One gradient for every batch, by the way that the class names to call it with other parameters."""
+    loss, clips = make_loss("paper").eval(), make_clip(2, 8)
+    params = {name: param.detach() for name, param in loss.named_parameters()}
+
+    def objective(params, clip):
+        with TensorDict(params).unflatten_keys(".").to_module(loss):
+            return sum(loss(clip).values())
+
+    found = torch.vmap(torch.func.grad(objective), (None, 0))(params, clips)
+    for place, clip in enumerate(clips):
+        gradients = torch.autograd.grad(sum(loss(clip).values()), list(loss.parameters()))
+        for name, gradient in zip(params, gradients, strict=True):
+            torch.testing.assert_close(found[name][place], gradient, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("name", ["lewm", "paper", "joint", "pldm"])
 def test_a_loss_runs_on_a_device_without_numbers(make_loss, make_clip, name):
     """On meta tensors, which know neither values nor autocast: terms of the right shape, with a gradient."""
@@ -503,6 +557,15 @@ def test_a_loss_runs_on_a_device_without_numbers(make_loss, make_clip, name):
     output = loss(make_clip().to("meta"))
     assert all(value.shape == () and value.device.type == "meta" for value in output.values())
     sum(output.values()).backward()
+
+
+@pytest.mark.parametrize("place, name", enumerate(["encoder", "predictor", "inverse_model"]))
+@pytest.mark.parametrize("other", [torch.nn.Linear(2, 2), None])
+def test_networks_that_say_not_what_they_read_are_refused(networks, place, name, other):
+    given = list(networks())
+    given[place] = other
+    with pytest.raises(TypeError, match=f"the {name} must be a TensorDictModule, got a .*: wrap a network as"):
+        FICRegLoss(*given)
 
 
 def test_unknown_choices_are_refused(networks):

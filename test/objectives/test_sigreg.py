@@ -91,6 +91,19 @@ def test_gradcheck(masked):
     assert torch.autograd.gradcheck(lambda value: sigreg(value, mask), latent)
 
 
+@pytest.mark.parametrize("masked", [True, False])
+def test_torch_func_gives_the_same_values_and_gradients(masked):
+    """``grad``, ``vmap`` and gradients of each of several batches."""
+    sigreg, latent = SIGReg(num_directions=32).eval(), torch.randn(2, 3, 8, 5, dtype=torch.float64, requires_grad=True)
+    mask = torch.rand(2, 3, 8) > 0.3 if masked else None
+    args = (latent,) if mask is None else (latent, mask)
+    values = torch.stack([sigreg(*batch) for batch in zip(*args)])
+    (gradient,) = torch.autograd.grad(values.sum(), latent)
+    torch.testing.assert_close(torch.vmap(sigreg)(*args), values)
+    torch.testing.assert_close(torch.vmap(torch.func.grad(sigreg))(*args), gradient)
+    torch.testing.assert_close(torch.func.grad(lambda *x: torch.vmap(sigreg)(*x).sum())(*args), gradient)
+
+
 def test_it_pulls_a_collapsed_batch_apart():
     latent = (0.01 * noise(64, 2)).requires_grad_()
     optimizer, sigreg = torch.optim.Adam([latent], 0.05), SIGReg(16)

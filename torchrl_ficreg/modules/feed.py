@@ -149,6 +149,19 @@ def require_tensordict(owner: str, value: object) -> None:
         )
 
 
+def require_module(owner: str, value: object) -> None:
+    """Refuses what does not say which entries it reads and writes, at the door of a loss, a model or a cost.
+
+    Raises:
+        TypeError: a plain ``nn.Module``, or anything else.
+    """
+    if not (callable(value) and hasattr(value, "in_keys") and hasattr(value, "out_keys")):
+        raise TypeError(
+            f"the {owner} must be a TensorDictModule, got a {type(value).__name__}: wrap a network as "
+            "TensorDictModule(network, in_keys=[...], out_keys=[...])."
+        )
+
+
 def choose_output(module: TensorDictModuleBase, key: NestedKey) -> NestedKey | None:
     """The entry ``key`` among what a module writes, or its only one, whatever that is called; None where there is none."""
     if len(module.out_keys) == 1:

@@ -1,7 +1,7 @@
 """Linear layers and attention whose training step is cheap on CPUs: same numbers, fewer passes over memory.
 
 Where torch's own kernels are as fast, these step aside: on GPUs, while ``torch.compile`` traces, for inference in float32,
-and, for linear layers, on processors without AMX. Shapes: N sequences, T tokens, C channels.
+and, for linear layers, on processors without AMX; and inside ``torch.func``, which cannot look into them. Shapes: N sequences, T tokens, C channels.
 """
 
 from __future__ import annotations
@@ -20,13 +20,18 @@ CACHED = 4 * 2**20  # bytes of attention weights worked on at once: more do not 
 
 
 def trains_on_cpu(x: torch.Tensor) -> bool:
-    """Whether gradients will be wanted of what is computed from x, on a CPU, outside of a compiled graph."""
-    return x.device.type == "cpu" and torch.is_grad_enabled() and not torch.compiler.is_compiling()
+    """Whether gradients will be wanted of what is computed from x, on a CPU, where these kernels can be called."""
+    return x.device.type == "cpu" and torch.is_grad_enabled() and not _transformed()
+
+
+def _transformed() -> bool:
+    """Whether ``torch.compile`` or a transform of ``torch.func`` is at work: both need torch's own operators."""
+    return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
 
 
 def suits_packed_attention(packed: torch.Tensor) -> bool:
     """Whether :func:`packed_attention` is the fastest: on CPUs, in training and in bfloat16."""
-    on_cpu = packed.device.type == "cpu" and not torch.compiler.is_compiling()
+    on_cpu = packed.device.type == "cpu" and not _transformed()
     return on_cpu and (torch.is_grad_enabled() or packed.dtype == torch.bfloat16)
 
 
@@ -43,7 +48,7 @@ def linear(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> 
         bias: [out], or None.
     """
     fits = bias is not None and weight.requires_grad and x.numel() >= MANY * x.shape[-1]
-    if fits and has_amx() and trains_on_cpu(x) and torch.is_autocast_enabled("cpu"):
+    if fits and trains_on_cpu(x) and torch.is_autocast_enabled("cpu") and has_amx():
         return _Linear.apply(x, weight, bias, torch.get_autocast_dtype("cpu"))
     return F.linear(x, weight, bias)
 

@@ -16,7 +16,7 @@ _STRIDE = 4  # pixels between neighbouring places of a map
 
 
 def spatial_softmax(maps: torch.Tensor) -> torch.Tensor:
-    """The expected place of each map's softmax (arXiv 1504.00702), in float32 whatever the maps are.
+    """The expected place of each map's softmax (arXiv 1504.00702), in at least float32.
 
     Args:
         maps: [N, K, H, W].
@@ -31,10 +31,11 @@ def spatial_softmax(maps: torch.Tensor) -> torch.Tensor:
         [[-1.0, 1.0]]
     """
     height, width = maps.shape[-2:]
-    x = torch.linspace(-1, 1, width, device=maps.device)
-    y = torch.linspace(-1, 1, height, device=maps.device)
+    maps = maps if maps.dtype == torch.float64 else maps.float()
+    x = torch.linspace(-1, 1, width, device=maps.device, dtype=maps.dtype)
+    y = torch.linspace(-1, 1, height, device=maps.device, dtype=maps.dtype)
     grid = torch.stack([x.repeat(height), y.repeat_interleave(width)], -1)  # [H * W, 2]
-    share = maps.float().flatten(-2).softmax(-1)  # [N, K, H * W]
+    share = maps.flatten(-2).softmax(-1)  # [N, K, H * W]
     return (share @ grid).transpose(-1, -2).flatten(-2)  # [N, K, 2] -> [N, 2 K]
 
 

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import nn
 from torch._C._functorch import is_functorch_wrapped_tensor
+from torch._subclasses import FakeTensor
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -24,14 +25,16 @@ def check_finite(pixels: torch.Tensor) -> None:
         raise ValueError(f"pixels {list(pixels.shape)} hold a NaN or an infinity: drop those frames, or keep them as uint8.")
 
 
-def _extremes(pixels: torch.Tensor) -> tuple[float, float] | None:
-    """Smallest and largest value, NaN where there is one. None for integers, and where no value can be looked at.
+def has_values(tensor: torch.Tensor) -> bool:
+    """Whether the numbers of a tensor can be looked at: not while it is traced, captured, faked or mapped, nor on meta."""
+    if torch.compiler.is_compiling() or tensor.is_meta or isinstance(tensor, FakeTensor):
+        return False
+    return not (is_functorch_wrapped_tensor(tensor) or tensor.is_cuda and torch.cuda.is_current_stream_capturing())
 
-    That is while a graph is traced, captured or mapped over a dimension.
-    """
-    if torch.compiler.is_compiling() or not pixels.is_floating_point() or not pixels.numel() or pixels.is_meta:
-        return None
-    if torch._C._functorch.is_batchedtensor(pixels) or pixels.is_cuda and torch.cuda.is_current_stream_capturing():
+
+def _extremes(pixels: torch.Tensor) -> tuple[float, float] | None:
+    """Smallest and largest value, NaN where there is one. None for integers, and where there is no value to be seen."""
+    if not (has_values(pixels) and pixels.is_floating_point() and pixels.numel()):
         return None
     low, high = torch.stack(pixels.detach().aminmax()).tolist()  # one transfer from an accelerator
     return low, high

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import platform
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import get_args, Literal
 
@@ -30,8 +32,11 @@ def has_fast_bf16(device: torch.device | str, kind: Kind = "products") -> bool:
     return device.type == "cpu" and bf16_speedup(kind) >= FAST
 
 
+_measuring = threading.Lock()  # two at once would disturb each other, and lose the number of threads they restore
+_speedups: dict[tuple[Kind, bool], float] = {}
+
+
 @torch.compiler.assume_constant_result
-@cache
 def bf16_speedup(kind: Kind = "products") -> float:
     """How many times faster than float32 this CPU trains a layer in bfloat16, measured once per process.
 
@@ -42,40 +47,53 @@ def bf16_speedup(kind: Kind = "products") -> float:
     Raises:
         KeyError: an unknown kind.
     """
+    # The modes of torch belong to a thread: in a new one no tensor is fake, traced, mapped or recorded.
+    case = kind, torch.backends.mkldnn.enabled  # torch.export switches oneDNN off while it traces
+    with _measuring:
+        if case not in _speedups:
+            with ThreadPoolExecutor(1) as thread:
+                _speedups[case] = thread.submit(_measure, kind).result()
+        return _speedups[case]
+
+
+def _measure(kind: Kind) -> float:
     make = {"products": _product, "convolutions": _convolution}[kind]
     least, threads = {}, torch.get_num_threads()
     torch.set_num_threads(1)  # threads wait for each other on a busy machine; the time of one is its own
     try:
-        with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
-            layers = {dtype: make(dtype) for dtype in (torch.float32, torch.bfloat16)}
-            for turn in range(5):  # kernels are prepared in the first
-                for dtype, layer in layers.items():
-                    began = time.thread_time()
-                    layer()
-                    if turn:
-                        least[dtype] = min(least.get(dtype, float("inf")), time.thread_time() - began)
-                if turn and least[torch.bfloat16] > 1.5 * least[torch.float32]:
-                    break  # no further turn will make up for that
+        layers = {dtype: make(dtype) for dtype in (torch.float32, torch.bfloat16)}
+        for turn in range(5):  # kernels are prepared in the first
+            for dtype, layer in layers.items():
+                began = time.thread_time()
+                layer()
+                if turn:
+                    least[dtype] = min(least.get(dtype, float("inf")), time.thread_time() - began)
+            if turn and least[torch.bfloat16] > 1.5 * least[torch.float32]:
+                break  # no further turn will make up for that
     finally:
         torch.set_num_threads(threads)
     return least[torch.float32] / least[torch.bfloat16]
 
 
+# Gradients without autograd, which a process forked from one that trains on a GPU cannot use.
 def _product(dtype: torch.dtype) -> Callable[[], object]:
     """A linear layer of 512 rows, as wide as the paper's networks, forward and backward."""
-    x = torch.ones(512, 192, dtype=dtype, device="cpu", requires_grad=True)
-    weight = torch.ones(768, 192, dtype=dtype, device="cpu", requires_grad=True)
+    x, weight = torch.ones(512, 192, dtype=dtype, device="cpu"), torch.ones(768, 192, dtype=dtype, device="cpu")
     above = torch.ones(512, 768, dtype=dtype, device="cpu")
-    return lambda: torch.autograd.grad(F.linear(x, weight), (x, weight), above)
+    return lambda: (F.linear(x, weight), above @ weight, above.t() @ x)
 
 
 def _convolution(dtype: torch.dtype) -> Callable[[], object]:
     """The second convolution of the keypoint encoder on 16 frames, forward and backward."""
-    x = torch.ones(16, 32, 32, 32, dtype=dtype, device="cpu").contiguous(memory_format=torch.channels_last)
-    weight = torch.ones(64, 32, 4, 4, dtype=dtype, device="cpu").contiguous(memory_format=torch.channels_last)
-    above = torch.ones(16, 64, 16, 16, dtype=dtype, device="cpu").contiguous(memory_format=torch.channels_last)
-    x.requires_grad_(), weight.requires_grad_()
-    return lambda: torch.autograd.grad(F.conv2d(x, weight, stride=2, padding=1), (x, weight), above)
+    shapes = (16, 32, 32, 32), (64, 32, 4, 4), (16, 64, 16, 16)
+    x, weight, above = (
+        torch.ones(shape, dtype=dtype, device="cpu").contiguous(memory_format=torch.channels_last) for shape in shapes
+    )
+    setting = [2, 2], [1, 1], [1, 1], False, [0, 0], 1  # stride, padding, dilation, transposed, output padding, groups
+    backward = torch.ops.aten.convolution_backward
+    return lambda: (
+        F.conv2d(x, weight, stride=2, padding=1), backward(above, x, weight, None, *setting, [True, True, False])
+    )
 
 
 @cache

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_ficreg.data.schema import ACTION, LATENT, PIXELS, PREDICTED_LATENT
 from torchrl_ficreg.data.statistics import ActionStatistics
-from torchrl_ficreg.modules.feed import arrange, choose_output, feed, Names, read_output
+from torchrl_ficreg.modules.feed import arrange, choose_output, feed, Names, read_output, require_module
 from torchrl_ficreg.modules.pixels import check_finite
 from torchrl_ficreg.modules.predictor import CausalPredictor
 
@@ -22,9 +22,14 @@ class LatentWorldModel(TensorDictModuleBase):
     Args:
         encoder: reads ``pixels`` [..., 3, H, W], writes ``latent`` [..., D].
         predictor: reads ``latent`` and ``action``, writes ``predicted_latent``; fed by name as in
-            :class:`~torchrl_ficreg.LeWMLoss`.
+            :class:`~torchrl_ficreg.LeWMLoss`. One of your own, or its network, has the attributes ``history``, the longest
+            window of latents it sees, ``latent_dim`` and ``action_dim``, the widths of a latent and of an action block.
         frame_skip: F, raw actions in one block.
         statistics: mean and std [A] of raw actions; zeros and ones when none are given.
+
+    Raises:
+        TypeError: an encoder or predictor that is no TensorDictModule, or a predictor without those attributes.
+        ValueError: an action block that is no multiple of ``frame_skip``, or keys that do not say which input is which.
 
     Examples:
         >>> import torch
@@ -45,8 +50,18 @@ class LatentWorldModel(TensorDictModuleBase):
         statistics: ActionStatistics | None = None,
     ) -> None:
         super().__init__()
+        for name, module in (("encoder", encoder), ("predictor", predictor)):
+            require_module(name, module)
         arrange("predictor", predictor.in_keys, self._names(encoder))
-        block = predictor.module.action_dim
+        missing = [name for name in ("history", "latent_dim", "action_dim") if not hasattr(predictor, name)]
+        if missing:
+            raise TypeError(
+                "a predictor of your own says how many latents it sees (history), how wide they are (latent_dim) and how wide "
+                f"an action block is (action_dim): give it, or its network, {' and '.join(missing)}."
+            )
+        if not (isinstance(frame_skip, int) and frame_skip >= 1):
+            raise ValueError(f"frame_skip must be a whole number of at least 1 action, got {frame_skip!r}.")
+        block = predictor.action_dim
         if block % frame_skip:
             raise ValueError(f"an action block of width {block} is no multiple of frame_skip {frame_skip}.")
         self.encoder, self.predictor, self.frame_skip = encoder, predictor, frame_skip
@@ -64,7 +79,7 @@ class LatentWorldModel(TensorDictModuleBase):
     @property
     def latent_dim(self) -> int:
         """D, the width of a latent."""
-        return self.predictor.module.latent_dim
+        return self.predictor.latent_dim
 
     @property
     def block_dim(self) -> int:
@@ -136,7 +151,7 @@ class LatentWorldModel(TensorDictModuleBase):
             )
         lead = latent.shape[:-2]
         rows, blocks = latent.reshape(-1, *latent.shape[-2:]), action.reshape(-1, *action.shape[-2:])
-        imagine = getattr(self.predictor.module, "imagine", self._imagine)
+        imagine = getattr(self.predictor, "imagine", self._imagine)
         return imagine(rows, blocks).reshape(*lead, -1, self.latent_dim)
 
     def _imagine(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:

@@ -16,7 +16,7 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_ficreg.data import schema
 from torchrl_ficreg.modules.collectives import num_processes, sum_over_processes
-from torchrl_ficreg.modules.feed import choose_output, feed, NEXT_LATENT
+from torchrl_ficreg.modules.feed import choose_output, feed, NEXT_LATENT, require_module
 from torchrl_ficreg.modules.inverse import LOG_VAR, SPREAD
 from torchrl_ficreg.modules.precision import in_autocast
 from torchrl_ficreg.objectives.clip import call, Clip, output, read_clip, read_frames
@@ -88,6 +88,7 @@ class LatentLoss(LossModule):
         self.reduction, self.num_frames = reduction, num_frames
         self._networks = tuple(networks)
         for name, module in networks.items():
+            require_module(name, module)
             self.convert_to_functional(module, name)
         self._check_networks()
         self._set_in_keys()
@@ -147,7 +148,8 @@ class LatentLoss(LossModule):
         self._check_size(*clip.pixels.shape[:-3])
         if clip.action.dtype == torch.float32:
             return clip
-        return clip._replace(action=clip.action.to(next(self.parameters()).dtype))  # as frames are
+        dtype = next((param.dtype for param in self.parameters()), clip.action.dtype)
+        return clip._replace(action=clip.action.to(dtype))  # as frames are
 
     def _check_size(self, *lead: int) -> None:
         """Whether the batch [..., T] is large enough, told in clips, before a layer tells it in channels."""

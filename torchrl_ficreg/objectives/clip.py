@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey, unravel_key
-from torch._C._functorch import is_functorch_wrapped_tensor
 
 from torchrl_ficreg.modules.collectives import sum_over_processes
 from torchrl_ficreg.modules.feed import choose_output
-from torchrl_ficreg.modules.pixels import check_finite
+from torchrl_ficreg.modules.pixels import check_finite, has_values
 
 
 class Clip(NamedTuple):
@@ -46,9 +46,9 @@ def read_clip(
     """Reads and checks a clip.
 
     Floating pixels are looked at in eager mode, on every device: a NaN would stay in the running statistics of BatchNorm.
-    Masks and actions are looked at on the CPU and in eager mode only, where it costs next to nothing. On an accelerator it
-    would hold up the queue, and in a compiled graph break it: there a wholly masked batch gives terms of zero, and actions
-    that are not finite give terms that are not.
+    Masks, actions and ``("next", "done")`` are looked at on the CPU and in eager mode only, where it costs next to nothing.
+    On an accelerator it would hold up the queue, and in a compiled graph break it: there a wholly masked batch gives terms
+    of zero, actions that are not finite give terms that are not, and clips that go on after an end are not noticed.
 
     Args:
         tensordict: left as it is.
@@ -61,7 +61,8 @@ def read_clip(
     Raises:
         KeyError: a key is missing.
         TypeError: an entry is no tensor, or actions are not floating.
-        ValueError: shapes that do not fit, no transition left by the mask, or pixels or actions that are not finite.
+        ValueError: shapes that do not fit, no transition left by the mask, pixels or actions that are not finite, or clips
+            that go on after ``("next", "done")``.
     """
     frames, blocks = read_frames(tensordict, pixels, num_frames), require(tensordict, action)
     if not blocks.is_floating_point():
@@ -89,8 +90,9 @@ def read_clip(
     if trusted is not None:
         blocks = torch.where(trusted.unsqueeze(-1), blocks, 0.0)
     check_finite(frames)
-    if blocks.device.type == "cpu" and not torch.compiler.is_compiling() and not is_functorch_wrapped_tensor(blocks):
+    if blocks.device.type == "cpu" and has_values(blocks):
         _check_values(blocks, trusted)
+        _check_ends(tensordict.get(("next", "done"), None), blocks.shape[:-1], trusted)
     return Clip(frames, blocks, trusted)
 
 
@@ -147,6 +149,20 @@ def _check_values(blocks: torch.Tensor, mask: torch.Tensor | None) -> None:
         raise ValueError(
             f"{bad} of {blocks[..., 0].numel()} action blocks hold a NaN or an infinity: set their mask to false, or "
             "drop them from the dataset."
+        )
+
+
+def _check_ends(done: torch.Tensor | None, transitions: torch.Size, mask: torch.Tensor | None) -> None:
+    """Refuses clips that go on after an end, if they say where one is: [..., T, 1], as a ``SliceSampler`` writes it."""
+    lead = (*transitions[:-1], transitions[-1] + 1)  # [..., T]
+    if done is None or done.numel() != math.prod(lead):
+        return
+    over = done.reshape(lead)[..., :-1].bool()  # [..., T - 1]; that of the last frame leads out of the clip
+    over = over if mask is None else over & mask
+    if over.any():
+        raise ValueError(
+            f"{over.sum().item()} transitions lead past ('next', 'done') into another trajectory: give the loss the "
+            "num_frames of the slices (SliceSampler, strict_length=True), or set their mask to false."
         )
 
 

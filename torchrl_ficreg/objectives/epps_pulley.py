@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 import torch.distributed as dist
 
-from torchrl_ficreg.modules.collectives import num_processes
+from torchrl_ficreg.modules.collectives import num_processes, sum_over_processes
 
 
 def epps_pulley(
@@ -27,7 +27,24 @@ def epps_pulley(
     Returns:
         [T, M], B times the weighted squared distance; differentiable in ``angle``, once.
     """
+    # torch.func cannot differentiate an operator that is not torch's own.
+    if not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active():
+        return _plainly(angle, mask, gaussian, weight)
     return _epps_pulley(angle, mask, gaussian, weight)[0]
+
+
+def _plainly(
+    angle: torch.Tensor, mask: torch.Tensor | None, gaussian: torch.Tensor, weight: torch.Tensor
+) -> torch.Tensor:
+    """As :func:`epps_pulley`, by torch's own operators: all knots at once, in K times the memory."""
+    order = torch.arange(1, len(weight) + 1, device=angle.device, dtype=angle.dtype).view(-1, 1, 1, 1)
+    phase = order * angle  # [K, T, B, M]
+    parts = torch.stack([phase.cos(), phase.sin()])  # [2, K, T, B, M]
+    parts = parts if mask is None else torch.where(mask.unsqueeze(-1), parts, 0.0)
+    count = sum_over_processes(_counts(angle, mask))  # [T]
+    cos, sin = sum_over_processes(parts.sum(-2)) / count.clamp_min(1).unsqueeze(-1)  # each [K, T, M]
+    distance = (cos - gaussian.view(-1, 1, 1)).square() + sin.square()
+    return count.unsqueeze(-1) * torch.einsum("ktm,k->tm", distance, weight)
 
 
 # An operator of its own: torch.compile takes it as it is, instead of tracing complex arithmetic it cannot generate.

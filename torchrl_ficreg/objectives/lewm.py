@@ -50,8 +50,9 @@ class LeWMLoss(LatentLoss):
     Raises:
         KeyError: the clip lacks a key.
         ValueError: an unknown reduction, a negative coefficient, networks that cannot be fed, a clip of one frame,
-            a batch of one clip, or widths the networks were not built for.
-        TypeError: pixels that are neither uint8 nor floating, or a plain dict for a tensordict.
+            a batch of one clip, clips that go on after ``("next", "done")``, or widths the networks were not built for.
+        TypeError: pixels that are neither uint8 nor floating, a plain dict for a tensordict, or a network that is no
+            TensorDictModule.
 
     Examples:
         >>> import torch

@@ -25,7 +25,7 @@ def check_bounds(world_model: LatentWorldModel, bounds: tuple[Sequence[float], S
         ValueError: another shape, a low above its high, or statistics that no actions in between have.
     """
     try:
-        low, high = (torch.as_tensor(bound, dtype=torch.float32).cpu() for bound in bounds)
+        low, high = (torch.as_tensor(bound, dtype=torch.float32, device="cpu") for bound in bounds)
     except (TypeError, ValueError) as error:
         raise ValueError(f"action_bounds must be (low, high) in environment units, got {bounds!r}.") from error
     shape = world_model.action_mean.shape

@@ -42,8 +42,8 @@ class LatentPlanner(MPCPlannerBase):
     environment by environment, and a plan on a CPU is the same to the last bit whatever is planned beside it.
 
     An action component that never changed in the training data stays at its mean in every candidate, as does one whose
-    bounds are equal. A model cast to another dtype is rolled out in that dtype unless ``config.precision`` is
-    ``"bf16"``; the search itself computes in float32, or in float64 for float64 latents.
+    bounds are equal. A model cast to another dtype is rolled out in that dtype, and a predictor of your own network in its
+    own, unless ``config.precision`` is ``"bf16"``; the search itself computes in float32, or in float64 for float64 latents.
 
     Args:
         world_model: the dynamics; put it into ``eval()`` first.
@@ -165,7 +165,7 @@ class LatentPlanner(MPCPlannerBase):
             latent = latent.unsqueeze(1)  # [E, 1, D]
         if past_action is None and latent.ndim == 3 and latent.shape[1] == 1:
             past_action = latent.new_zeros(len(latent), 0, self.world_model.block_dim)
-        seeds = list(range(len(latent))) if seeds is None else torch.as_tensor(seeds).long().flatten().tolist()
+        seeds = list(range(len(latent))) if seeds is None else torch.as_tensor(seeds, device="cpu").long().flatten().tolist()
         if initial is None:
             initial = latent.new_zeros(len(latent), self.config.horizon, self.world_model.block_dim)
         self._check_inputs(latent, goal, seeds, past_action, initial)
@@ -249,9 +249,14 @@ class LatentPlanner(MPCPlannerBase):
         return problem
 
     def _wants_bf16_copy(self) -> bool:
-        """Whether rollouts run in a bfloat16 copy of the predictor; a model cast by its user keeps its dtype."""
-        precision = self.config.precision
-        if precision == "auto" and _dtype_of(self.world_model.predictor, torch.empty(0)) != torch.float32:
+        """Whether rollouts run in a bfloat16 copy of the predictor.
+
+        Left to choose, a network of the user's own is not cast, as it may not bear the rounding, nor is one that its user cast.
+        """
+        precision, predictor = self.config.precision, self.world_model.predictor
+        if precision == "auto" and not (
+            hasattr(predictor, "imagine") and _dtype_of(predictor, torch.empty(0)) == torch.float32
+        ):
             precision = "fp32"
         return uses_bf16(self.world_model.action_mean.device, precision)
 
@@ -270,16 +275,17 @@ class LatentPlanner(MPCPlannerBase):
         past = past_action.unsqueeze(1).expand(-1, candidates, -1, -1)  # [e, K, C - 1, F * A]
         blocks = torch.cat([past, action], dim=2)
         dtype = _dtype_of(dynamics.predictor, start)
-        predicted = dynamics.rollout(start.to(dtype), blocks.to(dtype)).float()  # [e, K, horizon, D]
+        predicted = dynamics.rollout(start.to(dtype), blocks.to(dtype)).to(goal.dtype)  # [e, K, horizon, D]
         extra = {"action": action, "start": latent[:, -1]}
         with autocast(latent.device, "fp32" if dynamics is self.world_model else "bf16"):
             cost = self.cost(predicted, goal, **{name: extra[name] for name in self._wanted})
-        if cost.shape != action.shape[:2]:
+        shape = getattr(cost, "shape", type(cost).__name__)
+        if shape != action.shape[:2]:
             raise ValueError(
                 f"a cost maps predictions {list(predicted.shape)} and goals {list(goal.shape)} to [E, K] = "
-                f"{list(action.shape[:2])}, {type(self.cost).__name__} returned {list(cost.shape)}."
+                f"{list(action.shape[:2])}, {type(self.cost).__name__} returned {shape if isinstance(shape, str) else list(shape)}."
             )
-        return cost.float()
+        return cost.to(goal.dtype)
 
     @abc.abstractmethod
     def _search(self, problem: Problem) -> TensorDict:

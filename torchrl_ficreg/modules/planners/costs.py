@@ -16,13 +16,21 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torchrl_ficreg.data.schema import LATENT, RECOVERED_ACTION
-from torchrl_ficreg.modules.feed import arrange, feed, NEXT_LATENT, read_output
+from torchrl_ficreg.modules.feed import arrange, feed, NEXT_LATENT, read_output, require_module
 
 Cost = Callable[..., torch.Tensor]
 
 
 def wanted_by(cost: Cost) -> tuple[str, ...]:
-    """Which of ``action`` and ``start`` a cost names."""
+    """Which of ``action`` and ``start`` a cost names.
+
+    Raises:
+        TypeError: it cannot be called, or is a class in place of an instance of it.
+    """
+    if isinstance(cost, type) or not callable(cost):
+        raise TypeError(
+            f"a cost is a module or function (predicted, goal) -> [E, K], such as GoalDistance(), got {cost!r}."
+        )
     parameters = inspect.signature(cost.forward if isinstance(cost, nn.Module) else cost).parameters
     takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
     return tuple(name for name in ("action", "start") if takes_all or name in parameters)
@@ -105,6 +113,7 @@ class InverseConsistency(nn.Module):
 
     def __init__(self, inverse_model: TensorDictModuleBase) -> None:
         super().__init__()
+        require_module("inverse_model", inverse_model)
         arrange("inverse_model", inverse_model.in_keys, {LATENT: (), NEXT_LATENT: ()})
         self.inverse_model = inverse_model
 

@@ -41,6 +41,11 @@ class GradientPlanner(LatentPlanner):
         for _ in range(config.iterations):
             with torch.enable_grad():
                 cost = problem.cost(candidates)  # [e, K]
+                if not cost.requires_grad:
+                    raise ValueError(
+                        "the cost has no gradient with respect to the actions, without which there is nothing to descend: "
+                        "remove what detaches it in the predictor or the cost, or search with LatentCEMPlanner."
+                    )
                 (candidates.grad,) = torch.autograd.grad(cost.sum(), candidates)
             trace.append((cost.detach().amin(1), cost.detach().mean(1), candidates.detach().std(1).mean((-1, -2))))
             optimizer.step()

@@ -71,7 +71,7 @@ def coloured(white: torch.Tensor, beta: float, dim: int) -> torch.Tensor:
     length = white.shape[dim]
     if beta == 0 or length == 1:
         return white
-    frequency = torch.fft.fftfreq(length, device=white.device).abs()  # [length]
+    frequency = torch.fft.fftfreq(length, device=white.device, dtype=white.dtype).abs()  # [length]
     scale = frequency.clamp_min(1 / length) ** (-beta / 2)
     scale = scale / scale.square().mean().sqrt()
     half = scale[: length // 2 + 1].view(-1, *[1] * (white.ndim - 1 - dim % white.ndim))

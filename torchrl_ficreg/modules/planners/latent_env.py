@@ -100,20 +100,20 @@ class LatentGoalEnv(ModelBasedEnvBase):
             raise ValueError(f"unknown reward {reward!r}: choose one of {', '.join(map(repr, _REWARDS))}.")
         super().__init__(world_model, device=world_model.action_mean.device)
         self._rewards_progress = reward == "progress"
-        network, past = world_model.predictor.module, world_model.history - 1
+        latent_dim, block_dim, past = world_model.latent_dim, world_model.block_dim, world_model.history - 1
         kind = {"device": world_model.action_mean.device, "dtype": world_model.action_mean.dtype}
         self.observation_spec = Composite(
             {
-                LATENT: Unbounded((network.latent_dim,), **kind),
-                GOAL_LATENT: Unbounded((network.latent_dim,), **kind),
-                PAST_LATENT: Unbounded((past, network.latent_dim), **kind),
-                PAST_ACTION: Unbounded((past, network.action_dim), **kind),
+                LATENT: Unbounded((latent_dim,), **kind),
+                GOAL_LATENT: Unbounded((latent_dim,), **kind),
+                PAST_LATENT: Unbounded((past, latent_dim), **kind),
+                PAST_ACTION: Unbounded((past, block_dim), **kind),
                 PAST_LENGTH: Bounded(0, past, (1,), device=kind["device"], dtype=torch.int64),
             }
         )
         self.state_spec = self.observation_spec.clone()
         if action_bounds is None:
-            self.action_spec = Unbounded((network.action_dim,), **kind)
+            self.action_spec = Unbounded((block_dim,), **kind)
         else:
             self.action_spec = Bounded(*block_bounds(world_model, check_bounds(world_model, action_bounds)), **kind)
         self.reward_spec = Unbounded((1,), **kind)

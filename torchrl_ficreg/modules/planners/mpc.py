@@ -87,7 +87,7 @@ class MPCPolicy(TensorDictModuleBase):
                     "cursor": zeros + actions,
                     "count": zeros,
                     PLAN: like.new_zeros(envs, config.horizon, model.block_dim),
-                    PLAN_COST: like.new_zeros(envs, dtype=torch.float32),  # as planners give it
+                    PLAN_COST: like.new_zeros(envs, dtype=torch.float32),  # half precision would round it
                     "past_latent": like.new_zeros(envs, past, model.latent_dim),
                     PAST_ACTION: like.new_zeros(envs, past, model.block_dim),
                     "past_count": zeros.clone(),
@@ -106,7 +106,7 @@ class MPCPolicy(TensorDictModuleBase):
     @staticmethod
     def _seeds(td: TensorDictBase) -> torch.Tensor:
         seeds = td.get(PLAN_SEED, None)
-        return torch.arange(len(td)) if seeds is None else seeds.reshape(len(td)).cpu()
+        return torch.arange(len(td), device="cpu") if seeds is None else seeds.reshape(len(td)).cpu()
 
     @torch.no_grad()
     def _encode(self, pixels: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
@@ -130,7 +130,8 @@ class MPCPolicy(TensorDictModuleBase):
     def _plan(self, latent: torch.Tensor, goal: torch.Tensor, memory: TensorDict, seeds: torch.Tensor) -> TensorDict:
         """New memory of e environments whose present and goal are latents [e, D]."""
         model, config, device = self.planner.world_model, self.planner.config, latent.device
-        draws = torch.tensor([_mix(seed, count) for seed, count in zip(seeds.tolist(), memory["count"].tolist())])
+        mixed = [_mix(seed, count) for seed, count in zip(seeds.tolist(), memory["count"].tolist())]
+        draws = torch.tensor(mixed, device="cpu")
         initial = self._rest_of_last_plan(memory)  # [e, horizon, F * A]
         result = TensorDict({PLAN: torch.zeros_like(initial), PLAN_COST: torch.zeros_like(memory[PLAN_COST])}, [len(latent)])
         for past in memory["past_count"].unique().tolist():  # a context of one frame has no past, and no padding either
@@ -145,7 +146,7 @@ class MPCPolicy(TensorDictModuleBase):
                 initial=initial[rows],
             )
             result[PLAN][rows] = found[PLAN].to(initial.dtype)
-            result[PLAN_COST][rows] = found[PLAN_COST]
+            result[PLAN_COST][rows] = found[PLAN_COST].to(result[PLAN_COST].dtype)
         blocks = result[PLAN][:, : config.receding_horizon]  # [e, R, F * A]
         queue = blocks.unflatten(-1, (model.frame_skip, -1)).flatten(1, 2)  # [e, R * F, A]
         queue = model.statistics.denormalize(queue)

@@ -46,7 +46,7 @@ class Problem:
     def noise(self, count: int) -> torch.Tensor:
         """Standard normal draws [e, count, horizon, F * A], each environment's from its own generator."""
         shape = (count, *self.initial.shape[1:])
-        draws = [torch.randn(shape, generator=g, device=self.initial.device) for g in self.generators]
+        draws = [torch.randn(shape, generator=g, device=self.initial.device, dtype=torch.float32) for g in self.generators]
         return torch.stack(draws).to(self.initial.dtype)
 
 

@@ -379,6 +379,61 @@ def test_a_checkpoint_with_other_entries_than_ours_is_refused_before_it_is_loade
     assert not (tmp_path / "ran").exists()
 
 
+def _places_of(manifest, how):
+    """Lets an entry of a foreign adapter claim the folder of the world model, which is written in another way."""
+    record = manifest["components"]["world_model"]
+    plain = record["path"]
+    folder, name = plain.split("/")
+    places = {
+        "slash": f"{plain}/",
+        "dot": f"./{plain}",
+        "dots inside": f"{folder}/./{name}",
+        "two slashes": f"{folder}//{name}",
+        "backslash": f"{folder}\\{name}",
+        "upper case": plain.upper().replace(folder.upper(), folder),
+        "deeper": f"{plain}/state",
+        "same": plain,
+    }
+    manifest["components"]["mine"] = {**record, "adapter": "mine.lines", "path": plain}
+    record["path"] = places[how]
+    record["files"] = [*record["files"], "state/other.pickle"]
+
+
+@pytest.mark.parametrize("packed", [True, False], ids=["archive", "folder"])
+@pytest.mark.parametrize(
+    "how", ["slash", "dot", "dots inside", "two slashes", "backslash", "upper case", "deeper", "same"]
+)
+def test_no_way_of_writing_its_place_lets_a_foreign_entry_through(tmp_path, how, packed):
+    path = _poisoned(tmp_path / "run", tmp_path, "other.pickle")
+    manifest = json.loads((path / "manifest.json").read_text())
+    _places_of(manifest, how)
+    (path / "manifest.json").write_text(json.dumps(manifest))
+    if packed:
+        folder = path.rename(tmp_path / "folder")
+        shutil.make_archive(str(tmp_path / "packed"), "zip", folder)
+        (tmp_path / "packed.zip").rename(path)
+    with pytest.raises(ValueError, match="not loaded"):
+        load_world_model(path)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_tensor_that_the_manifest_does_not_list_is_no_tensor_of_zeros(finished, tmp_path):
+    shutil.copytree(finished[0], tmp_path / "run")
+    path = find_checkpoint(tmp_path / "run")
+
+    def edit(name, content):
+        if name != "manifest.json":
+            return content
+        manifest = json.loads(content)
+        files = manifest["components"]["world_model"]["files"]
+        files.remove(next(file for file in files if file.endswith(".memmap")))
+        return json.dumps(manifest)
+
+    repack(path, edit)
+    with pytest.raises(ValueError, match="does not list"):
+        load_world_model(path)
+
+
 def test_a_tensor_file_that_was_cut_is_refused_and_stays_as_it_is(tmp_path):
     path = _poisoned(tmp_path / "run", tmp_path, "extra.json")
     next(path.rglob("extra.json")).unlink()

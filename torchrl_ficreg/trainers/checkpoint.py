@@ -12,7 +12,7 @@ import tempfile
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -34,7 +34,7 @@ SUCCESS = "success_rate"  # in the manifest of a checkpoint; negative where it w
 _CARD, _MODEL, _INVERSE = "card", "world_model", "inverse_model"
 _MEMBERS = re.compile(r"manifest\.json|components/[\w.%-]+/(value\.json|state\.json|state/(meta\.json|tensor_\d+\.memmap))")
 _FOLDER = {"shape": [], "_type": "<class 'tensordict._td.TensorDict'>"}  # what meta.json notes beside tensors
-_PLACE = re.compile(r"components/[\w.%-]+")  # of one component
+_PLACE = re.compile(r"components/\d{4,}-[\w.%-]+", re.ASCII)  # of one component, as TorchRL writes it
 _MANIFEST = "manifest.json"
 _UNPACKED_SECONDS = 24 * 3600.0  # no loader takes as long
 _MOST_UNPACKED = 16  # times the size of an archive: what trained weights and moments never shrink by
@@ -230,13 +230,15 @@ def check_members(path: Path | str) -> None:
         ValueError: it holds files or entries other than the trainer writes, or a tensor file of another size than noted.
     """
     path = Path(path).expanduser()
-    foreign = _foreign_places(read_manifest(path))
+    own, foreign = _places(path)
     with _members(path) as (sizes, read):
         for name, size in sizes.items():
             if name.startswith(foreign):
                 continue
             if not _MEMBERS.fullmatch(name):
                 raise ValueError(f"{path} holds {name[:80]!r}, which no checkpoint of this package has: it is not loaded.")
+            if name != _MANIFEST and name not in own:  # nor would it be unpacked
+                raise ValueError(f"{path} holds {name[:80]!r}, which its manifest does not list: it is not loaded.")
             if name.endswith(".json") and size > MOST_JSON_BYTES:
                 raise ValueError(f"{path} is damaged: {name} takes {size} bytes, expected at most {MOST_JSON_BYTES}.")
         for name in (name for name in sizes if name.endswith("/state.json") and not name.startswith(foreign)):
@@ -260,15 +262,23 @@ def check_members(path: Path | str) -> None:
                     raise ValueError(f"{path} is damaged: {folder}{key}.memmap has {size} bytes, expected {need}.")
 
 
-def _foreign_places(manifest: Mapping[str, Any]) -> tuple[str, ...]:
-    """Where the files of components lie that an adapter of the user wrote.
+def _places(path: Path) -> tuple[set[str], tuple[str, ...]]:
+    """The files that TorchRL will read of the components it knows, and where those of other components lie.
 
-    Only that adapter reads them: TorchRL loads a component by the adapter that its manifest names, and refuses others.
+    The latter are of an adapter of the user, and only that adapter reads them: TorchRL loads a component by the adapter
+    that its manifest names, and refuses others.
+
+    Raises:
+        ValueError: two components lie in one place, or one inside another, by whatever way of writing it.
     """
-    records = manifest["components"].values()
-    own = {record["path"] for record in records if record["adapter"].startswith("torchrl.")}
-    others = {record["path"] for record in records} - own
-    return tuple(f"{place}/" for place in others if _PLACE.fullmatch(place))
+    records = list(read_manifest(path)["components"].values())
+    odd = [record["path"] for record in records if not _PLACE.fullmatch(record["path"])]
+    if odd or len({record["path"].casefold() for record in records}) < len(records):
+        what = f"puts a component in {odd[0][:80]!r}" if odd else "puts two components in one place"
+        raise ValueError(f"{path}: its manifest {what}, which no checkpoint of this package does: it is not loaded.")
+    own = [record for record in records if record["adapter"].startswith("torchrl.")]
+    files = {f"{record['path']}/{file}" for record in own for file in record["files"]}
+    return files, tuple(f"{record['path']}/" for record in records if record not in own)
 
 
 def _check_references(path: Path, name: str, read: Callable[[str], bytes]) -> None:

@@ -1,4 +1,4 @@
-"""Seconds per plan of our planners beside plain loops, and where the time goes: docs/results/planning_speed.json.
+"""Seconds per plan of our planners beside plain loops, and where the time goes: docs/results/planning_speed_*.json.
 
 All ways plan for the same latents with the same weights, in turns within one run, so that a busy machine slows all of
 them; times are the least of the repeats. The plain loop is what one writes first: in every iteration, for every
@@ -23,7 +23,7 @@ from torchrl_ficreg import LatentCEMPlanner, LatentGoalEnv, LatentWorldModel, ma
 from torchrl_ficreg.modules.memory import keep_freed_memory
 from torchrl_ficreg.modules.precision import autocast, describe_processor
 
-RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "planning_speed.json"
+RESULT = Path("planning_speed.json")
 HORIZON, ACTIONS = 5, 2
 BOUNDS = ([-1.0] * ACTIONS, [1.0] * ACTIONS)
 Way = Callable[[torch.Tensor, torch.Tensor], object]

@@ -1,4 +1,4 @@
-"""Seconds per training step, ours beside the plain formulation: docs/results/training_speed.json.
+"""Seconds per training step, ours beside the plain formulation: docs/results/training_speed_*.json.
 
 All ways train the same weights on the same clips: 8 of 4 frames at 224 pixels for the paper's model, 128 at 64 pixels for
 the small ones. Each lives in a process of its own, with the allocator's settings its users have, and they take turns
@@ -32,7 +32,7 @@ from torchrl_ficreg import FICRegLoss, make_world_model, ModelConfig
 from torchrl_ficreg.modules.memory import keep_freed_memory
 from torchrl_ficreg.modules.precision import autocast, describe_processor, Precision
 
-RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "training_speed.json"
+RESULT = Path("training_speed.json")
 ACTIONS = 2
 MODELS = {
     "paper": ModelConfig.preset("paper", predictor_attention_dropout=0.0),
@@ -52,7 +52,7 @@ PLAIN: dict[str, tuple[Mix, Precision]] = {
 def main() -> None:
     """Measures, prints and writes."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--model", choices=MODELS, default="paper")
+    parser.add_argument("--models", choices=MODELS, nargs="+", default=[*MODELS])
     parser.add_argument("--clips", type=int, help="default: 8, of the small models 128")
     parser.add_argument("--repeats", type=int, default=6, help="steps in each round")
     parser.add_argument("--rounds", type=int, default=3, help="of new processes")
@@ -60,12 +60,22 @@ def main() -> None:
     parser.add_argument("--profile", action="store_true", help="only print where the time of our step goes")
     parser.add_argument("--out", type=Path, help=f"default: {RESULT}")
     arguments = parser.parse_args()
-    clips, repeats, rounds = arguments.clips or (8 if arguments.model == "paper" else 128), arguments.repeats, arguments.rounds
-    if arguments.quick:
-        clips, repeats, rounds = 2, 1, 1
-    if arguments.profile:
-        return profile(make_way("ours", arguments.model, clips))
-    losses, seconds, cpu_seconds = measure(("ours", *PLAIN), arguments.model, clips, repeats, rounds)
+    repeats, rounds = (1, 1) if arguments.quick else (arguments.repeats, arguments.rounds)
+    results = {}
+    for model in arguments.models:
+        clips = 2 if arguments.quick else arguments.clips or (8 if model == "paper" else 128)
+        if arguments.profile:
+            profile(make_way("ours", model, clips))
+            continue
+        results[model] = measure_model(model, clips, repeats, rounds)
+    out = arguments.out or (None if arguments.quick or arguments.profile else RESULT)
+    if out:
+        out.write_text(json.dumps(results, indent=2) + "\n")
+
+
+def measure_model(model: str, clips: int, repeats: int, rounds: int) -> dict:
+    """All ways of one model, printed and returned."""
+    losses, seconds, cpu_seconds = measure(("ours", *PLAIN), model, clips, repeats, rounds)
     results = {
         "seconds_per_step": seconds,
         "cpu_seconds_per_step": cpu_seconds,
@@ -73,22 +83,19 @@ def main() -> None:
         "cpu_speedup": ratios(cpu_seconds),
         "losses": losses,
         "relative_difference_of_losses": differences(losses),
-        "floor": floor(make_way("textbook fp32", arguments.model, clips)),
+        "floor": floor(make_way("textbook fp32", model, clips)),
         "machine": {
             "processor": describe_processor(),
             "threads": torch.get_num_threads(),
             "torch": torch.__version__,
-            "model": arguments.model,
             "clips": clips,
-            "frames": MODELS[arguments.model].history + 1,
+            "frames": MODELS[model].history + 1,
             "repeats": repeats,
             "rounds": rounds,
         },
     }
-    report(results)
-    out = arguments.out or (None if arguments.quick else RESULT)
-    if out:
-        out.write_text(json.dumps(results, indent=2) + "\n")
+    report(model, results)
+    return results
 
 
 class Way:
@@ -247,8 +254,9 @@ def floor(way: Way) -> dict[str, float]:
     }
 
 
-def report(results: dict) -> None:
-    """Prints the table."""
+def report(model: str, results: dict) -> None:
+    """Prints the table of a model."""
+    print(f"\n{model}, on {results['machine']['processor']}")
     print(f"{'':<22}{'s per step':>12}{'cpu s':>9}{'ours is':>10}{'cpu':>8}{'losses differ':>15}{'grad norm':>11}")
     for name, spent in results["seconds_per_step"].items():
         row = f"{name:<22}{spent:>12.3f}{results['cpu_seconds_per_step'][name]:>9.3f}"

@@ -154,7 +154,7 @@ def describe_processor() -> str:
     """The CPU's name, the vector instructions that torch uses, and what bfloat16 is worth on it."""
     name = platform.processor() or platform.machine()
     with contextlib.suppress(OSError, StopIteration):
-        with open("/proc/cpuinfo") as lines:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:
             name = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     figures = (f"{bf16_speedup(kind):.1f} x in {kind}" for kind in get_args(Kind))
     capability = torch.backends.cpu.get_cpu_capability()

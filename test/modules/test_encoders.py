@@ -72,6 +72,12 @@ def test_the_default_dtype_of_a_script_decides_when_an_encoder_is_built_only(bui
     torch.testing.assert_close(encoder.double()(pixels=pixels).float(), expected)
 
 
+def test_a_mapped_encoder_compiles(encoder):
+    pixels = frames(4, 2)
+    compiled = torch.compile(torch.vmap(encoder.module), backend="eager")
+    torch.testing.assert_close(compiled(pixels), encoder(pixels=pixels))
+
+
 def test_every_pixel_has_a_gradient_under_torch_func(encoder):
     """Frame by frame, as for a map of what an encoder looks at."""
     pixels = torch.rand(4, 3, 16, 16, requires_grad=True)

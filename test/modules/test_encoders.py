@@ -41,6 +41,15 @@ def test_bytes_and_their_share_of_255_give_one_latent(encoder):
     torch.testing.assert_close(encoder(pixels=pixels / 255), encoder(pixels=pixels))
 
 
+@pytest.mark.parametrize("grad", [True, False])
+def test_no_frames_have_no_latents(encoder, grad):
+    with torch.set_grad_enabled(grad):
+        latent = encoder(pixels=frames(0))
+    assert latent.shape == (0, 6) and latent.requires_grad == grad
+    if grad:
+        latent.sum().backward()
+
+
 @pytest.mark.parametrize("lead", [(), (1,), (2, 4), (2, 1, 3)])
 def test_leading_dimensions_are_frames(encoder, lead):
     pixels = frames(*lead)
@@ -61,6 +70,12 @@ def test_the_default_dtype_of_a_script_decides_when_an_encoder_is_built_only(bui
     finally:
         torch.set_default_dtype(before)
     torch.testing.assert_close(encoder.double()(pixels=pixels).float(), expected)
+
+
+def test_a_mapped_encoder_compiles(encoder):
+    pixels = frames(4, 2)
+    compiled = torch.compile(torch.vmap(encoder.module), backend="eager")
+    torch.testing.assert_close(compiled(pixels), encoder(pixels=pixels))
 
 
 def test_every_pixel_has_a_gradient_under_torch_func(encoder):

@@ -100,6 +100,7 @@ def test_torch_func_gives_the_same_values_and_gradients(masked):
     values = torch.stack([sigreg(*batch) for batch in zip(*args)])
     (gradient,) = torch.autograd.grad(values.sum(), latent)
     torch.testing.assert_close(torch.vmap(sigreg)(*args), values)
+    torch.testing.assert_close(torch.compile(torch.vmap(sigreg), backend="eager", fullgraph=True)(*args), values)
     torch.testing.assert_close(torch.vmap(torch.func.grad(sigreg))(*args), gradient)
     torch.testing.assert_close(torch.func.grad(lambda *x: torch.vmap(sigreg)(*x).sum())(*args), gradient)
 

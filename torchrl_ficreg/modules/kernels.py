@@ -123,8 +123,9 @@ class _PackedAttention(torch.autograd.Function):
     @staticmethod
     def forward(ctx, packed: torch.Tensor, heads: int) -> torch.Tensor:
         (num, tokens, width), ctx.heads = packed.shape, heads
-        split = packed.view(num, tokens, 3, heads, -1).permute(2, 0, 3, 1, 4)  # [3, N, heads, T, dim_head]
-        split = split.reshape(3, num * heads, tokens, -1)  # [3, R, T, dim_head] for R heads of all sequences
+        dim_head = width // (3 * heads)  # a -1 would not do for N = 0
+        split = packed.view(num, tokens, 3, heads, dim_head).permute(2, 0, 3, 1, 4)  # [3, N, heads, T, dim_head]
+        split = split.reshape(3, num * heads, tokens, dim_head)  # [3, R, T, dim_head] for R heads of all sequences
         weights = packed.new_empty(num * heads, tokens, tokens)
         mixed = torch.empty_like(split[0])
         scale = split.shape[-1] ** -0.5
@@ -133,14 +134,14 @@ class _PackedAttention(torch.autograd.Function):
             torch.softmax(scores, -1, out=weight)
             torch.bmm(weight, value, out=out)
         ctx.save_for_backward(split, weights)
-        return mixed.view(num, heads, tokens, -1).transpose(1, 2).reshape(num, tokens, width // 3)
+        return mixed.view(num, heads, tokens, dim_head).transpose(1, 2).reshape(num, tokens, width // 3)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad: torch.Tensor) -> tuple[torch.Tensor, None]:
         split, weights = ctx.saved_tensors
         num, tokens, width = grad.shape
-        grad = grad.view(num, tokens, ctx.heads, -1).transpose(1, 2).reshape(split.shape[1:])  # [R, T, dim_head]
+        grad = grad.view(num, tokens, ctx.heads, width // ctx.heads).transpose(1, 2).reshape(split.shape[1:])  # [R, T, dim_head]
         grads = torch.empty_like(split)
         scale = split.shape[-1] ** -0.5
         for query, key, value, weight, above, for_query, for_key, for_value in _parts(
@@ -151,7 +152,7 @@ class _PackedAttention(torch.autograd.Function):
             slope = torch._softmax_backward_data(slope, weight, -1, weight.dtype)
             torch.baddbmm(for_query, slope, key, beta=0, alpha=scale, out=for_query)
             torch.baddbmm(for_key, slope.transpose(1, 2), query, beta=0, alpha=scale, out=for_key)
-        grads = grads.view(3, num, ctx.heads, tokens, -1).permute(1, 3, 0, 2, 4)  # [N, T, 3, heads, dim_head]
+        grads = grads.view(3, num, ctx.heads, tokens, width // ctx.heads).permute(1, 3, 0, 2, 4)  # [N, T, 3, heads, dim_head]
         return grads.reshape(num, tokens, 3 * width), None
 
 

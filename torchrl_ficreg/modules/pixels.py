@@ -84,7 +84,7 @@ class PixelNormalizer(nn.Module):
 
 def channels_last(frames: torch.Tensor) -> torch.Tensor:
     """Frames [N, 3, H, W] in the layout that convolutions on CPUs want; under ``vmap``, which knows none, as they are."""
-    if not torch.compiler.is_compiling() and is_functorch_wrapped_tensor(frames):
+    if torch._C._are_functorch_transforms_active():
         return frames
     return frames.contiguous(memory_format=torch.channels_last)
 

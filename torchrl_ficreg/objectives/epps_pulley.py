@@ -27,8 +27,7 @@ def epps_pulley(
     Returns:
         [T, M], B times the weighted squared distance; differentiable in ``angle``, once.
     """
-    # torch.func cannot differentiate an operator that is not torch's own.
-    if not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active():
+    if torch._C._are_functorch_transforms_active():  # torch.func cannot differentiate an operator that is not torch's own
         return _plainly(angle, mask, gaussian, weight)
     return _epps_pulley(angle, mask, gaussian, weight)[0]
 

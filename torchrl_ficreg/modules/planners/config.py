@@ -35,7 +35,7 @@ class PlanConfig:
     num_proposals: int = 30  # candidates of the first iteration that a policy proposes, where there is one, at most
     proposal_std: float = 0.3  # of the noise on all proposals but the first, in z-scored actions
     trace: bool = False  # also return cost and spread of every iteration
-    precision: Precision = "auto"  # of the imagined rollouts: "auto", "fp32" (as published) or "bf16"
+    precision: Precision = "auto"  # of the imagined rollouts: "auto" (bf16 where that is fast, own networks as they are), "fp32" or "bf16"
     compile: bool = False  # torch.compile the imagined rollouts; on CUDA with CUDA graphs
     memory_budget: float = 4.0  # GiB of a GPU that imagined rollouts may take; environments are planned in groups that fit
     seed: int = 0  # of the random draws

@@ -270,7 +270,10 @@ def test_a_setting_that_would_fail_later_is_refused_before_anything_is_written(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("overrides", [["method=lewm"], ["method=pldm", "method.idm_coeff=1.0", "plan.consistency=0.5"], ["plan.consistency=0.5"]])
+@pytest.mark.parametrize(
+    "overrides",
+    [["method=lewm"], ["method=pldm", "method.idm_coeff=1.0", "plan.consistency=0.5"], ["plan.consistency=0.5"]],
+)
 def test_an_inverse_model_that_is_trained_may_judge(scripts, config, overrides):
     cfg = config("train", *overrides)
     assert scripts("planning").check_consistency(cfg.plan, cfg) is None
@@ -359,6 +362,19 @@ def test_a_damaged_configuration_of_a_run_is_named(scripts, config, monkeypatch,
     with pytest.raises(ValueError, match="config.yaml is damaged|another configuration") as error:
         scripts("run_dir").check_run_dir(config("train", "name=a"))
     assert "\n" not in str(error.value) and len(str(error.value)) < 350
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["optim.lr=inf", "refine.lr=inf", "loss.idm_coeff=nan", "plan.effort=inf", "model.predictor_position_std=inf"]
+    + ["env.data.expert.noise_std=nan", "env.data.episodes=1000000000000", "model.image_size=1000000000000"]
+    + ["model.image_size=100000000", "optim.epochs=1000000000000", "collect.num_workers=100000", "evaluation.num_workers=100000"]
+    + ["loss.sigreg_start=x", "loss.sigreg_start=[]", "device=1", "device=[]", "method.name=x"],
+)
+def test_numbers_and_types_that_no_setting_can_have_are_named(scripts, config, override):
+    with pytest.raises(ValueError, match=override.split("=")[0].rpartition(".")[2]) as error:
+        scripts("utils").check_settings(config("train", override))
+    assert "\n" not in str(error.value) and len(str(error.value)) < 400
 
 
 @pytest.mark.parametrize("name", ["checkpoints", "wandb", "tensorboard"])

@@ -166,8 +166,10 @@ def check_results(results: Any) -> dict[str, Any]:
     for number in (*numbers, low, high, 0 if unsolved is None else unsolved):
         if isinstance(number, bool) or not isinstance(number, (int, float)) or not math.isfinite(number):
             raise ValueError(f"{str(number)[:40]!r} is no number")
-    [results[key] for key in SHARED if key != "weights"]  # which older ones lack
-    flatten({"plan": {**results["plan"]}})
+    shared = {key: results[key] for key in SHARED if key != "weights"}  # which older ones lack
+    for key, value in {**shared, **flatten({**results["plan"]})}.items():
+        if not f"{key}{str(value)[:24]}".isprintable():  # it could move the cursor of a terminal
+            raise ValueError(f"{key[:40]!r}={str(value)[:24]!r} is no setting")
     if not row_name(results).isprintable() or len(row_name(results)) > 80:
         raise ValueError("method and search are no names")
     return results

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import secrets
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from torchrl import torchrl_logger
 from torchrl.record.loggers import get_logger, Logger
 from utils import flatten
 
-from torchrl_ficreg._utils import write_atomic
+from torchrl_ficreg._utils import read_bytes, write_atomic
 from torchrl_ficreg.trainers import TolerantLogger
 
 PICTURES = ("learning_curve.png", "latent_distance.png")
@@ -28,8 +29,9 @@ def make_logger(cfg: DictConfig, run_dir: Path) -> TolerantLogger | None:
     backend = cfg.logger.backend
     if backend == "csv":
         return None
+    run_id = _run_id(run_dir) if backend == "wandb" else None
     try:
-        logger = TolerantLogger(_connect(cfg, run_dir))
+        logger = TolerantLogger(_connect(cfg, run_dir, run_id))
     except ImportError as error:
         package = "'torchrl_ficreg[wandb]'" if backend == "wandb" else "tensorboard"
         raise ImportError(f"logger.backend={backend} needs a package: pip install {package}.") from error
@@ -44,20 +46,27 @@ def make_logger(cfg: DictConfig, run_dir: Path) -> TolerantLogger | None:
     return logger
 
 
-def _connect(cfg: DictConfig, run_dir: Path) -> Logger:
+def _connect(cfg: DictConfig, run_dir: Path, run_id: str | None) -> Logger:
     backend, extra = cfg.logger.backend, {}
     if backend == "wandb":
-        extra["wandb_kwargs"] = {"mode": cfg.logger.mode, "project": cfg.logger.project, "id": _run_id(run_dir)}
+        extra["wandb_kwargs"] = {"mode": cfg.logger.mode, "project": cfg.logger.project, "id": run_id}
     return get_logger(backend, logger_name=str(run_dir / backend), experiment_name=cfg.name, **extra)
 
 
 def _run_id(run_dir: Path) -> str:
-    """Under which wandb knows the run, in all its lives."""
+    """Under which wandb knows the run, in all its lives.
+
+    Raises:
+        ValueError: what is noted is no id.
+    """
     path = run_dir / "wandb" / "run_id"
     if not path.exists():
         path.parent.mkdir(exist_ok=True)
         write_atomic(path, secrets.token_hex(4))
-    return path.read_text(encoding="utf-8")
+    run_id = read_bytes(path, most=128).decode(errors="replace").strip()
+    if not re.fullmatch(r"[\w-]+", run_id, re.ASCII):
+        raise ValueError(f"{path} holds {run_id[:40]!r}, which is no id of a run of wandb: remove it to get another one.")
+    return run_id
 
 
 def publish(logger: TolerantLogger | None, results: dict[str, Any], names: tuple[str, ...], run_dir: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -40,9 +41,9 @@ def plan_config(plan: DictConfig) -> PlanConfig:
         raise ValueError(f"unknown plan.search {search!r}: choose one of {sorted(SEARCHES)}.")
     if values.get("cost", "goal") not in COSTS:
         raise ValueError(f"unknown plan.cost {values['cost']!r}: choose one of {sorted(COSTS)}.")
-    wrong = [f"plan.{name}={values[name]}" for name in COST_FIELDS[1:] if not values.get(name, 0.0) >= 0]
+    wrong = [f"plan.{name}={values[name]}" for name in COST_FIELDS[1:] if not 0 <= values.get(name, 0.0) < math.inf]
     if wrong:
-        raise ValueError(f"must not be negative: {', '.join(wrong)}.")
+        raise ValueError(f"must be finite and not negative: {', '.join(wrong)}.")
     settings = {key: value for key, value in values.items() if key not in (*COST_FIELDS, "policy")}
     kind = SEARCHES[search].config_class
     foreign = sorted(settings.keys() - {field.name for field in fields(kind)})

@@ -61,6 +61,9 @@ def check_run_dir(cfg: DictConfig) -> Path:
         ValueError: it holds a run of another configuration, or any run under ``resume=never``.
     """
     run_dir, ours = Path(cfg.runs_dir) / cfg.name, OmegaConf.to_container(cfg, resolve=True)
+    for name in (CHECKPOINTS, "wandb", "tensorboard"):  # a folder from elsewhere may have come with its links
+        if (run_dir / name).is_symlink():
+            raise ValueError(f"{run_dir / name} is a link, through which nothing is written: remove it, or give another name=...")
     path = run_dir / "config.yaml"
     if path.exists() and ((run_dir / METRICS).exists() or (run_dir / CHECKPOINTS).exists()):
         theirs = _read_config(path)

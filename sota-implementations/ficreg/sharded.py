@@ -30,6 +30,8 @@ def record_shards(cfg: DictConfig, path: Path, meta: dict[str, Any]) -> Path:
     check_collector(cfg.collect.collector)
     count = begun[NUM_SHARDS] if begun else min(max(1, cfg.collect.num_workers), total)
     shares = [range(shard, total, count) for shard in range(count)]
+    for link in (path / SHARD.format(shard) for shard in range(count) if (path / SHARD.format(shard)).is_symlink()):
+        raise ValueError(f"{link} is a link, through which nothing is written: put the shard in its place.")
     numbered = begun is None or SHARD_NUMBER in begun  # the first shards ever recorded are not
     with contextlib.ExitStack() as stack:
         writers = [

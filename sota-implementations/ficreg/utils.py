@@ -50,6 +50,8 @@ from torchrl_ficreg.trainers.distributed import launched, world_size
 from torchrl_ficreg.trainers.parallel import check_processes
 
 EASY_START, EASY_RANDOM = 0.2, 0.5  # shares of pairs above which an evaluation tells little
+MOST_COUNT, MOST_WORKERS = 10**8, 1024  # of anything counted in a configuration; of processes
+METHODS = ("ficreg", "lewm", "joint_inverse", "pldm")
 MOST_LAYERS = 1000  # of the predictor; building more takes minutes even without their memory
 SIGREG_FALL = 0.8  # share of training after which lambda has its last value
 
@@ -60,6 +62,7 @@ def get_device(name: str) -> torch.device:
     Raises:
         ValueError: there is no such device on this machine.
     """
+    name = str(name)  # device=1
     try:
         torch.device("cpu" if name == "auto" else name)
     except RuntimeError as error:  # which lists every backend there ever was
@@ -234,6 +237,7 @@ def check_settings(cfg: DictConfig, training: bool = True) -> None:
         ImportError: a package that a setting needs is missing.
         ValueError: a setting outside its range, an unknown choice, or settings that do not fit each other.
     """
+    check_values(cfg)
     plan_config(cfg.plan)
     check_consistency(cfg.plan, cfg)
     check_collector(cfg.collect.collector)
@@ -258,7 +262,8 @@ def check_settings(cfg: DictConfig, training: bool = True) -> None:
             f"method.consistency_steps={cfg.method.consistency_steps} is deeper than a clip: give at most "
             f"model.history={cfg.model.history}, or raise that."
         )
-    if cfg.loss.sigreg_start is not None and not (cfg.loss.sigreg_start > 0 and cfg.loss.sigreg_coeff > 0):
+    start = cfg.loss.sigreg_start
+    if start is not None and not (isinstance(start, (int, float)) and start > 0 and cfg.loss.sigreg_coeff > 0):
         raise ValueError(
             "loss.sigreg_start and loss.sigreg_coeff must be positive to fall from one to the other, got "
             f"{cfg.loss.sigreg_start} and {cfg.loss.sigreg_coeff}."
@@ -305,6 +310,22 @@ def check_settings(cfg: DictConfig, training: bool = True) -> None:
         check_recording(cfg)
     if cfg.dataset is None and training:
         check_amounts(cfg)
+
+
+def check_values(cfg: DictConfig) -> None:
+    """Refuses numbers that no setting can have, and names of methods that do not exist.
+
+    Raises:
+        ValueError: one is not finite, or a count is beyond all that a machine can do.
+    """
+    for key, value in flatten(OmegaConf.to_container(cfg)).items():
+        if isinstance(value, float) and not math.isfinite(value) and key != "optim.clip_norm":  # inf: no clipping
+            raise ValueError(f"{key}={value}: expected a finite number.")
+        most = MOST_WORKERS if key.endswith("num_workers") else MOST_COUNT
+        if isinstance(value, int) and value > most and not key.endswith("seed"):
+            raise ValueError(f"{key}={value}: expected at most {most}.")
+    if cfg.method.name not in METHODS:
+        raise ValueError(f"method.name={cfg.method.name} is unknown: leave it out, and choose by method=.")
 
 
 def make_networks_without_memory(cfg: DictConfig) -> tuple[LatentWorldModel, InverseDynamicsModel]:

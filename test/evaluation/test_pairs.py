@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 
@@ -123,6 +124,14 @@ def test_what_is_no_manifest_is_refused_by_its_path(tmp_path, text):
     path.write_bytes(text.encode("utf-8", "surrogateescape"))
     with pytest.raises(ValueError, match="pairs.json is not a manifest"):
         StartGoalPairs.load(path)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero"), lambda path: path.write_text("[" * 10**5)])
+def test_no_file_in_place_of_a_manifest_holds_the_reader_up(tmp_path, make):
+    make(tmp_path / "pairs.json")
+    with pytest.raises(ValueError, match="pairs.json is not a manifest") as error:
+        StartGoalPairs.load(tmp_path / "pairs.json")
+    assert len(str(error.value)) < 500
 
 
 def test_runs_that_write_one_manifest_at_once_do_not_disturb_each_other(tmp_path):

@@ -271,7 +271,10 @@ def test_a_setting_that_would_fail_later_is_refused_before_anything_is_written(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("overrides", [["method=lewm"], ["method=pldm", "method.idm_coeff=1", "plan.consistency=0.5"], ["plan.consistency=0.5"]])
+@pytest.mark.parametrize(
+    "overrides",
+    [["method=lewm"], ["method=pldm", "method.idm_coeff=1.0", "plan.consistency=0.5"], ["plan.consistency=0.5"]],
+)
 def test_an_inverse_model_that_is_trained_may_judge(scripts, config, overrides):
     cfg = config("train", *overrides)
     assert scripts("planning").check_consistency(cfg.plan, cfg) is None
@@ -362,6 +365,51 @@ def test_a_damaged_configuration_of_a_run_is_named(scripts, config, monkeypatch,
     assert "\n" not in str(error.value) and len(str(error.value)) < 350
 
 
+@pytest.mark.parametrize(
+    "override",
+    ["optim.lr=inf", "refine.lr=inf", "loss.idm_coeff=nan", "plan.effort=inf", "model.predictor_position_std=inf"]
+    + ["env.data.expert.noise_std=nan", "env.data.episodes=1000000000000", "model.image_size=1000000000000"]
+    + ["model.image_size=100000000", "optim.epochs=1000000000000", "collect.num_workers=100000", "evaluation.num_workers=100000"]
+    + ["loss.sigreg_start=x", "loss.sigreg_start=[]", "device=1", "device=[]", "method.name=x"],
+)
+def test_numbers_and_types_that_no_setting_can_have_are_named(scripts, config, override):
+    with pytest.raises(ValueError, match=override.split("=")[0].rpartition(".")[2]) as error:
+        scripts("utils").check_settings(config("train", override))
+    assert "\n" not in str(error.value) and len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize("name", ["checkpoints", "wandb", "tensorboard"])
+def test_nothing_is_written_through_a_link_in_a_folder_of_a_run(scripts, config, monkeypatch, tmp_path, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "runs" / "a").mkdir(parents=True)
+    (tmp_path / "runs" / "a" / name).symlink_to(tmp_path / "thesis")
+    with pytest.raises(ValueError, match=f"a/{name} is a link"):
+        scripts("run_dir").check_run_dir(config("train", "name=a"))
+
+
+def test_nothing_is_recorded_through_a_link_in_place_of_a_shard(scripts, config, tmp_path):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "shard-1").symlink_to(tmp_path / "thesis")
+    settings = config("collect", "collect.collector=async", "collect.num_workers=2", "env.data.episodes=2")
+    with pytest.raises(ValueError, match="shard-1 is a link"):
+        scripts("sharded").record_shards(settings, tmp_path / "data", {})
+    assert not any((tmp_path / "thesis").iterdir())
+
+
+@pytest.mark.parametrize("content", ["", "../other", "a b", "a\nb", "x" * 200, None])
+def test_an_id_of_wandb_that_is_none_is_named(scripts, tmp_path, content):
+    file = tmp_path / "wandb" / "run_id"
+    file.parent.mkdir()
+    os.mkfifo(file) if content is None else file.write_text(content)
+    with pytest.raises(ValueError, match="run_id") as error:
+        scripts("loggers")._run_id(tmp_path)
+    assert "\n" not in str(error.value)
+    file.unlink()
+    assert scripts("loggers")._run_id(tmp_path) == scripts("loggers")._run_id(tmp_path)
+
+
 @pytest.mark.parametrize("value", ["${oc.env:SECRET}", "x${oc.env:SECRET}", "${oc.decode:1}", "${plan.seed}", ["${oc.env:SECRET}"]])
 @pytest.mark.parametrize("key", ["dataset", "plan", "env", "new"])
 def test_interpolations_of_a_card_are_not_resolved(scripts, config, monkeypatch, key, value):
@@ -379,7 +427,7 @@ def test_interpolations_of_a_card_are_not_resolved(scripts, config, monkeypatch,
 
 @pytest.mark.parametrize("settings", [{}, {"plan": {}}, {"plan": 3, "env": {}, "method": {}, "model": {}}])
 def test_a_card_without_settings_is_named(scripts, settings):
-    with pytest.raises(ValueError, match="the checkpoint's card holds no settings of .*plan|method"):
+    with pytest.raises(ValueError, match="the checkpoint's card holds no settings of .*(plan|method)"):
         scripts("utils").settings_of_card(ModelCard({}, "two_room", {}, [-1.0], [1.0], settings))
 
 
@@ -399,12 +447,14 @@ def test_evaluations_keep_folders_of_their_own_and_stand_in_one_table(scripts, t
     for name, plan in zip(names, ({"search": "cem", "horizon": 1}, {"search": "cem", "horizon": 2})):
         (tmp_path / name).mkdir()
         (tmp_path / name / "results.json").write_text(json.dumps(make_results(plan=plan)))
-    for name, text in {"torn": "{", "list": "[]", "old": json.dumps({"ficreg": {}}), "text": json.dumps(make_results(plan="x"))}.items():
+    escapes = {"key": make_results(plan={"\x1b[2J": 1, "search": "cem"}), "value": make_results(pairs="\x1b[2J")}
+    escapes = {name: json.dumps(results) for name, results in escapes.items()}
+    for name, text in {"torn": "{", "list": "[]", "old": json.dumps({"ficreg": {}}), "text": json.dumps(make_results(plan="x")), **escapes}.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "results.json").write_text(text)
     others = evaluate.read_others(tmp_path, names[0])
     assert list(others) == [names[1]]
-    assert capsys.readouterr().out.count("left out of the table") == 4
+    assert capsys.readouterr().out.count("left out of the table") == 6
     evaluate.show({names[0]: make_results(plan={"search": "cem", "horizon": 1}), **others})
     out = capsys.readouterr().out
     assert "horizon=1" in out and "horizon=2" in out and out.count("ficreg, cem") == 2

@@ -11,6 +11,7 @@ from typing import Any
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
+from torchrl_ficreg._utils import read_json, write_atomic
 from torchrl_ficreg.data.sampler import ClipSampler
 
 _STATE_FILE = "position.json"
@@ -110,11 +111,11 @@ class SeekableReplayBuffer(TensorDictReplayBuffer):
     def dumps(self, path: str | Path) -> None:
         """Saves :meth:`state_dict` in a directory."""
         Path(path).mkdir(parents=True, exist_ok=True)
-        (Path(path) / _STATE_FILE).write_text(json.dumps(self.state_dict()), encoding="utf-8")
+        write_atomic(Path(path) / _STATE_FILE, json.dumps(self.state_dict()))
 
     def loads(self, path: str | Path) -> None:
         """Loads what :meth:`dumps` saved."""
-        self.load_state_dict(json.loads((Path(path) / _STATE_FILE).read_text(encoding="utf-8")))
+        self.load_state_dict(read_json(Path(path) / _STATE_FILE, "position"))
 
     def _use_one_reader(self) -> None:
         # TorchRL starts as many threads as batches to prefetch. They take turns at one lock in no fixed order, so

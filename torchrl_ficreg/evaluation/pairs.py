@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_ficreg._utils import write_atomic
+from torchrl_ficreg._utils import read_json, write_atomic
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.data.schema import STATE
 
@@ -151,12 +151,12 @@ class StartGoalPairs:
             ValueError: it is not one, or its hash does not fit its content.
         """
         try:
-            content: dict[str, Any] = json.loads(Path(path).read_text(encoding="utf-8"))
+            content: dict[str, Any] = read_json(path, "manifest")
             stored = content.pop("hash")
             arrays = {name: np.array(content.pop(name)) for name in ("episode", "step", "start_state", "goal_state")}
             pairs = cls(**content, **arrays)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path} is not a manifest of start-goal pairs ({error!r}): move it away to draw new ones.") from error
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+            raise ValueError(f"{path} is not a manifest of start-goal pairs ({error!r:.200}): move it away to draw new ones.") from error
         if pairs.hash != stored:
             raise ValueError(f"{path} was changed after it was drawn: its hash does not fit. Move it away to draw again.")
         return pairs

@@ -247,7 +247,7 @@ def load_goal_policy(
             wanted = GoalPolicy(**sizes).module.state_dict()
         check_shapes(wanted, shapes)
     # A missing field, a foreign one, tensors of another network.
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:160]
         raise ValueError(
             f"{folder}: {CONFIG_FILE} and {WEIGHTS_FILE} do not belong together ({reason}): train the policy again."

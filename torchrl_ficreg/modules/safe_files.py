@@ -168,22 +168,23 @@ def check_sizes(sizes: Mapping[str, Any], num_tensors: int) -> None:
         ValueError: a value out of range or of another type.
     """
     for name, value in sizes.items():
-        if isinstance(value, Mapping):
+        rate = name.endswith("dropout")
+        if isinstance(value, Mapping) and not rate:
             check_sizes(value, num_tensors)
             continue
-        values, most = list(value) if isinstance(value, (list, tuple)) else [value], _LARGEST
+        values, most = list(value) if isinstance(value, (list, tuple)) and not rate else [value], _LARGEST
         if name.endswith("depth") or name == "members":
             most = num_tensors
         elif name == "image_size":
             most = _LARGEST_IMAGE
-        if len(values) > num_tensors:
+        if not 0 < len(values) <= num_tensors:
             raise ValueError(f"{name} lists {len(values)} layers, the file of weights has {num_tensors} tensors.")
         for number in values:
-            if isinstance(number, str):
+            if isinstance(number, str) and number and not rate:  # the kind of a network
                 continue
             if isinstance(number, bool) or not isinstance(number, (int, float)):
                 raise ValueError(f"{name} must be a number, got {str(number)[:40]!r}.")
-            if name.endswith("dropout"):
+            if rate:
                 if not 0 <= number < 1:
                     raise ValueError(f"{name} must lie in [0, 1), got {number}.")
             elif isinstance(number, float):
@@ -236,7 +237,7 @@ def check_numbers(tensors: Mapping[str, torch.Tensor], where: Path | str) -> Non
     for name, value in tensors.items():
         if not value.is_floating_point():
             continue
-        if not value.isfinite().all():
+        if not value.float().isfinite().all():  # networks are in float32, which does not hold every float64
             raise ValueError(f"{where}: {name} holds a NaN or an infinity: the training failed, or the file is damaged.")
         if name.endswith("running_var") and (value < 0).any():
             raise ValueError(f"{where}: {name} holds a negative variance: the file is damaged, restore it.")

@@ -480,7 +480,7 @@ def load_world_model(path: Path | str) -> tuple[LatentWorldModel, InverseDynamic
         parts = dict(zip(kept, make_world_model(ModelConfig(**card.model), card.action_dim)))
         for name, part in parts.items():
             part.load_state_dict(kept[name].state)
-    except (ValueError, TypeError, KeyError, AttributeError, ArithmeticError, RuntimeError) as error:
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{path} is not a whole checkpoint of a world model ({reason}).") from error
     return parts[_MODEL].eval(), parts[_INVERSE].eval(), card

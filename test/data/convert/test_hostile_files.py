@@ -354,6 +354,56 @@ def test_what_is_not_about_the_file_stays_what_it_is(kind):
             raise kind("x")
 
 
+@pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float32])
+def test_a_picture_of_more_than_8_bits_is_refused_not_cut_off(tmp_path, make_rows, dtype):
+    image, parquet, arrow = (pytest.importorskip(name) for name in ("PIL.Image", "pyarrow.parquet", "pyarrow"))
+    picture = image.fromarray((np.arange(SIZE * SIZE).reshape(SIZE, SIZE) * 200).astype(dtype))
+    if picture.mode == "F":
+        picture = picture.convert("I")
+    buffer = io.BytesIO()
+    picture.convert("I;16").save(buffer, "PNG")
+    path = write_lerobot(tmp_path / "robot", make_rows([20, 20]))
+    for file in (path / "data").rglob("*.parquet"):
+        table = parquet.read_table(file)
+        place, cells = table.column_names.index("observation.images.top"), [{"bytes": buffer.getvalue(), "path": ""}] * len(table)
+        parquet.write_table(table.set_column(place, "observation.images.top", arrow.array(cells)), file)
+    with pytest.raises(KeyError) as error:
+        open_source(path)
+    assert "8 bits" in one_line(error, "robot")
+
+
+@pytest.mark.parametrize("writer", [write_lerobot, write_lance])
+def test_a_first_row_of_many_numbers_is_refused_before_it_becomes_objects(tmp_path, make_rows, writer):
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    path = writer(tmp_path / "table.lance", make_rows([20, 20]))
+    junk = arrow.array([np.zeros(20 * MIB, np.float32)] + [[]] * 19, arrow.list_(arrow.float32()))
+    if writer is write_lerobot:
+        file = min((path / "data").rglob("*.parquet"))
+        parquet.write_table(parquet.read_table(file).append_column("junk", junk), file, compression="zstd")
+    else:
+        lance = pytest.importorskip("lance")
+        table = lance.dataset(str(path)).to_table().slice(0, 20).append_column("junk", junk)
+        lance.write_dataset(table, str(path), mode="overwrite")
+    tracemalloc.start()
+    with pytest.raises(ValueError) as error:
+        open_source(path)
+    assert tracemalloc.get_traced_memory()[1] < 128 * MIB  # as objects, half a gigabyte
+    tracemalloc.stop()
+    assert "first row takes" in one_line(error, "table.lance")
+
+
+def test_a_chunk_of_gigabytes_is_not_unpacked_for_one_row(tmp_path, make_rows):
+    h5py = pytest.importorskip("h5py")
+    path = write_swm_hdf5(tmp_path / "x.h5", make_rows([20, 20]))
+    with h5py.File(path, "r+") as file:
+        shape = file["pixels"].shape
+        del file["pixels"]
+        file.create_dataset("pixels", shape, "u1", maxshape=(None, *shape[1:]), chunks=(2**20, *shape[1:]), compression="gzip")
+    with pytest.raises(KeyError) as error:
+        open_source(path)
+    assert "chunks of 805306368 bytes" in one_line(error, "x.h5")
+
+
 def test_a_pipe_in_place_of_a_file_does_not_wait(tmp_path, make_rows):
     os.mkfifo(tmp_path / "x.h5")
     with pytest.raises(ValueError, match="a pipe or a device"):
@@ -362,6 +412,10 @@ def test_a_pipe_in_place_of_a_file_does_not_wait(tmp_path, make_rows):
     os.mkfifo(path / "data/chunk-000/file-009.parquet")
     with pytest.raises(ValueError, match="no regular file"):
         open_source(path)
+    (path / "data/chunk-000/file-009.parquet").unlink()
+    (path / "meta/episodes").mkdir()
+    os.mkfifo(path / "meta/episodes/file-000.parquet")  # it only helps to find torn episodes
+    assert read_all(path, allow_incomplete=True) == 2
 
 
 @pytest.mark.parametrize("seed", range(3))

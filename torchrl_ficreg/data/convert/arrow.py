@@ -10,6 +10,9 @@ from torchrl_ficreg.data.convert.images import decode
 from torchrl_ficreg.data.convert.table import Column, require
 
 
+_MOST_ROW_BYTES = 64 * 2**20  # of one row; a small file can declare lists that fill the memory
+
+
 def describe(kind: Any, cell: Any, rows: int) -> Column | str:
     """Says what an Arrow column holds, or why it cannot be read.
 
@@ -31,6 +34,22 @@ def describe(kind: Any, cell: Any, rows: int) -> Column | str:
         kind, cell = kind.value_type, cell[0] if cell else None
     number = types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)
     return Column(tuple(shape), "number" if number else "text", rows)
+
+
+def first_cells(head: Any) -> dict[str, Any]:
+    """The first value of every column, as Python objects; empty where there is no row.
+
+    Args:
+        head: at most one row, a ``RecordBatch`` or ``Table``.
+
+    Raises:
+        ValueError: the row is too large for that: as objects, numbers take eight times their size.
+    """
+    if head is None or not len(head):
+        return {}
+    if head.nbytes > _MOST_ROW_BYTES:
+        raise ValueError(f"its first row takes {head.nbytes} bytes, expected at most {_MOST_ROW_BYTES}: write smaller columns")
+    return head.to_pylist()[0]
 
 
 def picture_bytes(cell: Any) -> bytes | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import posixpath
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ EPISODE_IDS = ("episode_idx", "ep_idx")
 # A chunk of the official files is 100 frames of 224 x 224, 15 MB. h5py's own cache of 1 MB holds none, so that every
 # chunk an episode shares with its neighbour would be decompressed twice.
 _CHUNK_CACHE_BYTES = 64 * 1024 * 1024
+_MOST_CHUNK_BYTES = 512 * 1024 * 1024  # unpacked to read one row; compressed, a small file can declare 4 GB
 
 
 class HDF5Table(Table):
@@ -143,6 +145,9 @@ def _describe(data: Any) -> Column | str:
         dtype = data.dtype
     except TypeError as error:
         return f"has a type that numpy does not know ({brief(error, 60)})"
+    piece = prod(data.chunks) * dtype.itemsize if data.chunks else 0
+    if piece > _MOST_CHUNK_BYTES:
+        return f"is stored in chunks of {piece} bytes, of which a row needs one: write it with chunks of a few rows"
     kind = "text" if dtype.kind not in "biuf" else "image" if dtype == np.uint8 and len(shape) > 1 else "number"
     return Column(tuple(shape), kind, rows)
 

@@ -40,6 +40,8 @@ def decode(cells: Sequence[bytes], shape: tuple[int, ...] | None = None, *, firs
 
     def size_of(row: int) -> tuple[int, int, int]:
         with image.open(io.BytesIO(cells[row]), formats=_PICTURES) as picture:
+            if picture.mode.startswith(("I", "F")):  # which Pillow would cut off at 255
+                raise ValueError(f"it has more than 8 bits a channel (mode {picture.mode}): scale it to 0..255 first")
             return (picture.height, picture.width, 3)
 
     def work(start: int, stop: int) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from torchrl_ficreg.data.convert.arrow import describe, split, to_array
+from torchrl_ficreg.data.convert.arrow import describe, first_cells, split, to_array
 from torchrl_ficreg.data.convert.table import bounds_from_ids, check_inside, check_steps, require, some, Table
 
 EPISODE_IDS, STEPS = ("episode_idx", "ep_idx"), "step_idx"
@@ -40,7 +40,7 @@ class LanceTable(Table):
             raise ValueError(f"{path} keeps rows outside of its folder, which is not followed: copy the table as a whole.")
         rows = self._dataset.count_rows()
         head = self._dataset.to_table(limit=1)
-        cells = head.to_pylist()[0] if rows else {}
+        cells = first_cells(head)
         columns, self.left_out = split(
             {field.name: describe(field.type, cells.get(field.name), rows) for field in head.schema}
         )

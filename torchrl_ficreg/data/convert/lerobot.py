@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_ficreg.data.convert.arrow import describe, split, to_array
+from torchrl_ficreg._utils import MOST_JSON_BYTES, read_bytes
+from torchrl_ficreg.data.convert.arrow import describe, first_cells, split, to_array
 from torchrl_ficreg.data.convert.table import (
     Bounds,
     bounds_from_ids,
@@ -106,7 +107,7 @@ class LeRobotTable(Table):
         # Where every row group of every file begins, counted over all files.
         self._groups = [(file, group) for file, group, _ in groups]
         self._group_starts = np.cumsum([0, *(count for _, _, count in groups)])
-        cells = head.to_pylist()[0] if head is not None else {}
+        cells = first_cells(head)
         schema = self._files[0].schema_arrow
         columns, self.left_out = split(
             {field.name: describe(field.type, cells.get(field.name), total) for field in schema}
@@ -156,7 +157,7 @@ class LeRobotTable(Table):
 def _read_info(path: Path) -> dict[str, Any]:
     check_inside(path / INFO, path)
     try:
-        info = json.loads((path / INFO).read_text(encoding="utf-8"))
+        info = json.loads(read_bytes(path / INFO, most=MOST_JSON_BYTES).decode())
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path / INFO} is no JSON object ({brief(error)}): fetch the data set again.") from error
     if not isinstance(info, dict):
@@ -172,10 +173,12 @@ def _declared_lengths(path: Path, parquet: Any) -> dict[int, int]:
     lengths: dict[int, int] = {}
     try:
         if (path / "meta/episodes.jsonl").is_file():
-            for line in (path / "meta/episodes.jsonl").read_text(encoding="utf-8").splitlines():
+            check_inside(path / "meta/episodes.jsonl", path)
+            for line in read_bytes(path / "meta/episodes.jsonl", most=MOST_JSON_BYTES).decode().splitlines():
                 episode = json.loads(line)
                 lengths[int(episode[EPISODE_IDS])] = int(episode["length"])
         for file in sorted((path / "meta/episodes").rglob("[!.]*.parquet")):
+            check_inside(file, path)
             columns = parquet.read_table(file, columns=[EPISODE_IDS, "length"]).to_pydict()
             lengths.update(zip(columns[EPISODE_IDS], columns["length"]))
     except Exception:  # it only helps to find torn episodes

@@ -251,6 +251,7 @@ class EpisodeSource:
 
     def _usual_pixels(self) -> list[str]:
         cameras = [name for name in self.table.of_kind("image") if name.startswith("observation.images.")]
+        cameras = cameras or [name for name in self.table.left_out if name.startswith("observation.images.")][:1]
         return [*OTHER_PIXELS, *(cameras if len(cameras) == 1 else [])]  # of several, the user has to choose
 
     def _choose_state(self, state: str | Sequence[str] | None, usual: Sequence[Sequence[str]]) -> list[str]:

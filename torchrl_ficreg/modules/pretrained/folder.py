@@ -134,7 +134,7 @@ def load_pretrained(
         with torch.device("meta"):
             wanted = state_of(_build(described))
         statistics, card = content["statistics"], content["card"]
-    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:160] if isinstance(error, ValueError) else repr(error)[:160]
         raise ValueError(f"{config} does not describe a world model ({reason}).") from error
     if not isinstance(card, dict):

@@ -76,7 +76,7 @@ def load_lewm(
         adopted = _adopt(described, tensors)
         model = build_world_model(sizes)
         model.load_state_dict(adopted | {name: model.get_buffer(name) for name in _STATISTICS})
-    except (ValueError, TypeError, RuntimeError, ArithmeticError, AttributeError) as error:
+    except (ValueError, TypeError, LookupError, RuntimeError, ArithmeticError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{file} cannot be read as a LeWM checkpoint: {reason}") from error
     if statistics is not None:
@@ -174,7 +174,7 @@ def _read_tensors(file: Path) -> dict[str, torch.Tensor]:
             raise ValueError(f"{file}: {name!r} {what}: save the state_dict() of the model alone.")
         tensors[name] = value
     # A tensor may repeat the bytes of its storage, and several may share one: copied, they would take more than the file.
-    if any(value.device.type != "cpu" or value.layout != torch.strided for value in tensors.values()):
+    if any(value.device.type != "cpu" or value.layout != torch.strided or value.is_nested for value in tensors.values()):
         raise ValueError(f"{file} holds tensors that are not plain arrays: save the state_dict() of the model on the CPU.")
     need = sum(value.numel() * value.element_size() for value in tensors.values())
     if need > size:
@@ -189,6 +189,9 @@ def _check_archive(file: Path, size: int) -> None:
     Raises:
         ValueError: it does, or it is no archive, as PyTorch writes since 1.6.
     """
+    with open(file, "rb") as content:  # an archive may be appended to anything, and PyTorch looks at the beginning
+        if content.read(4) != b"PK\x03\x04":
+            raise ValueError("no archive of PyTorch")
     try:
         with zipfile.ZipFile(file) as archive:
             need = sum(entry.file_size for entry in archive.infolist())

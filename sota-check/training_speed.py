@@ -23,7 +23,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import torch
-from plain_formulation import fused, Mix, plain_terms, textbook
+from plain_formulation import fused, Mix, parts, plain_encoder, plain_terms, textbook
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
@@ -75,12 +75,14 @@ def main() -> None:
 
 def measure_model(model: str, clips: int, repeats: int, rounds: int) -> dict:
     """All ways of one model, printed and returned."""
-    losses, seconds, cpu_seconds = measure(("ours", *PLAIN), model, clips, repeats, rounds)
+    losses, seconds, cpu_seconds, encoding = measure(("ours", *PLAIN), model, clips, repeats, rounds)
     results = {
         "seconds_per_step": seconds,
         "cpu_seconds_per_step": cpu_seconds,
+        "seconds_per_encoding": encoding,
         "speedup": ratios(seconds),
         "cpu_speedup": ratios(cpu_seconds),
+        "speedup_of_encoding": ratios(encoding),
         "losses": losses,
         "relative_difference_of_losses": differences(losses),
         "floor": floor(make_way("textbook fp32", model, clips)),
@@ -106,11 +108,13 @@ class Way:
         start: FICRegLoss,
         clip: TensorDictBase,
         objective: Callable[[FICRegLoss, TensorDictBase], Terms],
+        encode: Callable[[FICRegLoss, torch.Tensor], torch.Tensor],
         precision: Precision,
         *,
         fused: bool,
     ) -> None:
         self.loss, self.clip, self.objective, self.precision = start, clip, objective, precision
+        self.encode = encode
         self.params = [param for param in self.loss.parameters() if param.requires_grad]
         kind = {"fused": True} if fused else {}  # torch's own choice, as one writes it first
         self.optimizer = torch.optim.AdamW(self.params, lr=5e-5, weight_decay=1e-3, **kind)
@@ -127,6 +131,14 @@ class Way:
         nn.utils.clip_grad_norm_(self.params, 1.0)
         self.optimizer.step()
         self.optimizer.zero_grad()
+        return time.perf_counter() - began, time.process_time() - busy
+
+    @torch.no_grad()
+    def encoding(self) -> tuple[float, float]:
+        """The frames of all clips to latents: wall and processor seconds."""
+        began, busy = time.perf_counter(), time.process_time()
+        with autocast("cpu", self.precision):
+            self.encode(self.loss, self.clip["pixels"])
         return time.perf_counter() - began, time.process_time() - busy
 
     def compare(self) -> dict[str, float]:
@@ -148,9 +160,9 @@ def make_way(name: str, model: str, clips: int) -> Way:
     start, clip = starting_point(MODELS[model]), random_clips(MODELS[model], clips)
     if name == "ours":
         keep_freed_memory(KEPT)
-        return Way(start, clip, our_terms, "auto", fused=True)
+        return Way(start, clip, our_terms, our_latents, "auto", fused=True)
     mix, precision = PLAIN[name]
-    return Way(start, clip, partial(plain_terms, mix=mix), precision, fused=False)
+    return Way(start, clip, partial(plain_terms, mix=mix), partial(plain_latents, mix=mix), precision, fused=False)
 
 
 def starting_point(config: ModelConfig) -> FICRegLoss:
@@ -177,18 +189,30 @@ def our_terms(loss: FICRegLoss, clip: TensorDictBase) -> Terms:
     return dict(loss(clip).items())
 
 
-def measure(names: tuple[str, ...], model: str, clips: int, repeats: int, rounds: int) -> tuple[dict, dict, dict]:
-    """Of each way: its losses, and the least wall and processor seconds of a step."""
-    losses, wall, cpu = {}, *(dict.fromkeys(names, math.inf) for _ in range(2))
+def our_latents(loss: FICRegLoss, pixels: torch.Tensor) -> torch.Tensor:
+    """[B, T, 3, H, W] -> [B, T, D]."""
+    return parts(loss, "encoder")(pixels)
+
+
+def plain_latents(loss: FICRegLoss, pixels: torch.Tensor, mix: Mix) -> torch.Tensor:
+    """As :func:`our_latents`, plain."""
+    return plain_encoder(parts(loss, "encoder"), pixels, mix)
+
+
+def measure(names: tuple[str, ...], model: str, clips: int, repeats: int, rounds: int) -> tuple[dict, dict, dict, dict]:
+    """Of each way: its losses, the least wall and processor seconds of a step, and the least seconds of encoding."""
+    losses, wall, cpu, encoding = {}, *(dict.fromkeys(names, math.inf) for _ in range(3))
     for _ in range(rounds):
         with ways(names, model, clips) as pipes:
             losses = losses or {name: ask(pipe, "compare") for name, pipe in pipes.items()}  # the same in every round
             for repeat in range(-3, repeats):  # kernels choose their blocking at first, then allocators settle
                 for name, pipe in pipes.items():
                     spent, busy = ask(pipe, "step")
+                    alone, _ = ask(pipe, "encoding")
                     if repeat >= 0:
                         wall[name], cpu[name] = min(wall[name], spent), min(cpu[name], busy)
-    return losses, wall, cpu
+                        encoding[name] = min(encoding[name], alone)
+    return losses, wall, cpu, encoding
 
 
 @contextmanager
@@ -257,11 +281,13 @@ def floor(way: Way) -> dict[str, float]:
 def report(model: str, results: dict) -> None:
     """Prints the table of a model."""
     print(f"\n{model}, on {results['machine']['processor']}")
-    print(f"{'':<22}{'s per step':>12}{'cpu s':>9}{'ours is':>10}{'cpu':>8}{'losses differ':>15}{'grad norm':>11}")
+    print(f"{'':<22}{'s per step':>12}{'cpu s':>9}{'ours is':>10}{'cpu':>8}{'encoding':>10}{'ours is':>10}{'losses differ':>15}{'grad norm':>11}")
     for name, spent in results["seconds_per_step"].items():
         row = f"{name:<22}{spent:>12.3f}{results['cpu_seconds_per_step'][name]:>9.3f}"
         factor, cpu_factor = (results[key].get(name) for key in ("speedup", "cpu_speedup"))
         row += f"{factor:>8.2f} x{cpu_factor:>6.2f} x" if factor else " " * 18
+        alone, factor = results["seconds_per_encoding"][name], results["speedup_of_encoding"].get(name)
+        row += f"{alone:>10.3f}" + (f"{factor:>8.2f} x" if factor else " " * 10)
         difference = results["relative_difference_of_losses"].get(name)
         if difference:
             worst = max(value for key, value in difference.items() if key.startswith("loss"))

@@ -105,7 +105,7 @@ def test_a_policy_plans_and_proposes(trained, modules, evaluate, tmp_path):
         (["plan.search=dreamer"], "unknown plan.search 'dreamer': choose one of"),
         (["plan=icem", "plan.search=cem"], "plan.search=cem has no decay, kept_elites, .*: choose it by plan=cem"),
         (["plan.cost=energy"], r"unknown plan.cost 'energy': choose one of \['goal', 'path'\]"),
-        (["plan.effort=-1", "plan.consistency=-0.5"], "must not be negative: plan.effort=-1, plan.consistency=-0.5"),
+        (["plan.effort=-1", "plan.consistency=-0.5"], "must be finite and not negative: plan.effort=-1, plan.consistency=-0.5"),
         (["plan.horizon=3", "plan.receding_horizon=1"], "plan.horizon=3 blocks of 5 steps reach .* 10 steps.* most 2"),
         (["plan.num_elites=21"], "num_elites must lie between 2 and num_candidates=20, got 21"),
         (["plan.receding_horizon=3"], "receding_horizon at most horizon"),

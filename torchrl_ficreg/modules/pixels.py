@@ -29,7 +29,8 @@ def has_values(tensor: torch.Tensor) -> bool:
     """Whether the numbers of a tensor can be looked at: not while it is traced, captured, faked or mapped, nor on meta."""
     if torch.compiler.is_compiling() or tensor.is_meta or isinstance(tensor, FakeTensor):
         return False
-    return not (is_functorch_wrapped_tensor(tensor) or tensor.is_cuda and torch.cuda.is_current_stream_capturing())
+    captured = tensor.is_cuda and torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing()
+    return not (captured or is_functorch_wrapped_tensor(tensor))
 
 
 def _extremes(pixels: torch.Tensor) -> tuple[float, float] | None:

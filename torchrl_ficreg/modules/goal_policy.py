@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import torch
@@ -13,19 +12,17 @@ from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.feed import sort_keys
 from torchrl_ficreg.modules.goal_network import GoalNetwork
 from torchrl_ficreg.modules.safe_files import (
-    as_float32,
     check_kinds,
     check_shapes,
     check_sizes,
     CHECKSUM,
     checksum_of,
     config_file,
-    json_text,
     read_config,
     read_shapes,
     read_tensors,
-    replace_files,
     require_safetensors,
+    save_model,
 )
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
@@ -203,13 +200,11 @@ def save_goal_policy(policy: GoalPolicy, folder: Path | str, world_model: Latent
         >>> torch.equal(same.module(latent, -latent), policy.module(latent, -latent))
         True
     """
-    safetensors = require_safetensors()
+    require_safetensors()
     policy.check_fits(world_model)
     content = {"format": FORMAT, "version": VERSION, "sizes": policy.sizes, "world_model": _checksum(world_model)}
     folder = Path(folder).expanduser()
-    weights = safetensors.torch.save(as_float32(policy.module.state_dict()), metadata={"format": "pt"})
-    content[CHECKSUM] = hashlib.sha256(weights).hexdigest()
-    replace_files(folder, (WEIGHTS_FILE, weights), (CONFIG_FILE, json_text(content)))
+    save_model(folder, WEIGHTS_FILE, policy.module.state_dict(), CONFIG_FILE, content)
     return folder
 
 

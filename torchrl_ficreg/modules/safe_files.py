@@ -35,6 +35,27 @@ def require_safetensors() -> ModuleType:
     return safetensors
 
 
+def save_model(
+    folder: Path, weights: str, state: Mapping[str, torch.Tensor], config: str, content: Mapping[str, Any]
+) -> None:
+    """Writes a state in float32 as safetensors, and its configuration with the checksum of that file, by :func:`replace_files`.
+
+    Args:
+        folder: made if missing.
+        weights, config: names of the two files.
+        state: tensors by name.
+        content: of the configuration, without the checksum.
+
+    Raises:
+        ImportError: safetensors is not installed.
+        TypeError, ValueError: the configuration has values other than those of JSON.
+        OSError: the files cannot be written; the old ones stay as they are.
+    """
+    data = require_safetensors().torch.save(as_float32(state), metadata={"format": "pt"})
+    text = json_text({**content, CHECKSUM: hashlib.sha256(data).hexdigest()})
+    replace_files(folder, (weights, data), (config, text))
+
+
 def replace_files(folder: Path, weights: tuple[str, bytes], config: tuple[str, str]) -> None:
     """Writes a file of weights and the configuration beside it, as one: at any instant the old or the new model is there.
 

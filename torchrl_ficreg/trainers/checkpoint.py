@@ -465,9 +465,9 @@ def load_world_model(path: Path | str) -> tuple[LatentWorldModel, InverseDynamic
             raise ValueError(f"{path}: its card has bounds of {card.action_dim} actions, its model {len(model.action_mean)}.")
         return model, inverse_model, card
     path = find_checkpoint(path)
-    card = read_card(path)
+    check_members(path)
     kept = {_MODEL: _State(), _INVERSE: _State()}
-    _load(dict(kept), path)
+    card = _card(_load({_CARD: {}, **kept}, path).get(_CARD), path)  # in one call: each unpacks the archive
     try:
         # Compared with what the file has before the networks take memory.
         found = {f"{part}.{name}": value for part, holder in kept.items() for name, value in dict(holder.state).items()}

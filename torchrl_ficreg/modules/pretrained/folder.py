@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from torchrl_ficreg.modules.pretrained.sizes import (
     world_model_sizes,
 )
 from torchrl_ficreg.modules.safe_files import (
-    as_float32,
     check_kinds,
     check_shapes,
     check_sizes,
@@ -29,8 +27,8 @@ from torchrl_ficreg.modules.safe_files import (
     read_config,
     read_shapes,
     read_tensors,
-    replace_files,
     require_safetensors,
+    save_model,
     state_of,
 )
 from torchrl_ficreg.modules.world_model import LatentWorldModel
@@ -79,7 +77,7 @@ def save_pretrained(
         >>> read == card, torch.equal(same.predictor.module.position, model.predictor.module.position)
         (True, True)
     """
-    safetensors = require_safetensors()
+    require_safetensors()
     card, sizes = dict(card or {}), world_model_sizes(model)
     _check_card(card, model, sizes)
     parts: dict[str, nn.Module] = {_MODEL: model} | ({} if inverse_model is None else {_INVERSE: inverse_model})
@@ -91,14 +89,12 @@ def save_pretrained(
         "statistics": _statistics(model),
         "card": card,
     }
-    weights = safetensors.torch.save(as_float32(state_of(parts)), metadata={"format": "pt"})
-    content[CHECKSUM] = hashlib.sha256(weights).hexdigest()
     try:
-        text = json_text(content)
+        json_text(card)
     except (TypeError, ValueError, RecursionError) as error:
         raise TypeError(f"the card must hold JSON values only ({error}).") from error
     folder = Path(folder).expanduser()
-    replace_files(folder, (WEIGHTS_FILE, weights), (CONFIG_FILE, text))
+    save_model(folder, WEIGHTS_FILE, state_of(parts), CONFIG_FILE, content)
     return folder
 
 

@@ -6,6 +6,7 @@ package. Shapes: N rows, T tokens, C channels.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import torch
@@ -15,6 +16,7 @@ from torch import nn
 
 from torchrl_ficreg import FICRegLoss
 from torchrl_ficreg.modules.pixels import IMAGENET_MEAN, IMAGENET_STD
+from torchrl_ficreg.modules.precision import bf16_speedup, has_fast_bf16, Precision
 from torchrl_ficreg.objectives.sigreg import standard_normal
 
 Mix = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, bool], torch.Tensor]
@@ -164,3 +166,19 @@ def plain_projector(layer: nn.Module, x: torch.Tensor, track: bool = True) -> to
     hidden = F.linear(x, layer.layer_in.weight, layer.layer_in.bias)
     hidden = F.gelu(F.batch_norm(hidden, *statistics, norm.weight, norm.bias, training=True))
     return F.linear(hidden, layer.layer_out.weight, layer.layer_out.bias)
+
+
+def plain_precisions() -> list[Precision]:
+    """Those in which a plain formulation may be the best: not bfloat16 where its products take over twice as long."""
+    return ["fp32", "bf16"] if bf16_speedup() > 0.5 else ["fp32"]
+
+
+def matrix_rate() -> float:
+    """Operations per second of a large matrix product in the faster precision."""
+    a, b = torch.randn(2, 2048, 2048).to(torch.bfloat16 if has_fast_bf16("cpu") else torch.float32)
+    times = []
+    for _ in range(20):
+        began = time.perf_counter()
+        a @ b
+        times.append(time.perf_counter() - began)
+    return 2 * 2048**3 / min(times)

@@ -11,10 +11,12 @@ import argparse
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
+from plain_formulation import matrix_rate, plain_precisions
 from tensordict import TensorDict
 from torch.utils.flop_counter import FlopCounterMode
 from torchrl.modules.planners import CEMPlanner
@@ -78,10 +80,10 @@ def world_model(preset: str) -> LatentWorldModel:
 def against_plain_loop(model: LatentWorldModel, envs: int, iterations: int, repeats: int) -> dict:
     """Seconds per plan, ours and the plain loop in fp32 and under bf16 autocast."""
     config = PlanConfig(iterations=iterations, num_candidates=300, num_elites=30, horizon=HORIZON)
-    ways = {
-        "ours": LatentCEMPlanner(model, config, action_bounds=BOUNDS).plan,
-        "plain fp32": lambda latent, goal: plain_cem(model, latent, goal, iterations, "fp32"),
-        "plain bf16 autocast": lambda latent, goal: plain_cem(model, latent, goal, iterations, "bf16"),
+    ways = {"ours": LatentCEMPlanner(model, config, action_bounds=BOUNDS).plan}
+    ways |= {
+        f"plain {precision}": partial(plain_cem, model, iterations=iterations, precision=precision)
+        for precision in plain_precisions()
     }
     seconds = in_turns(ways, envs, model.latent_dim, repeats)
     row = {"environments": envs, "iterations": iterations, "seconds_per_plan": seconds}
@@ -202,17 +204,6 @@ def profile(model: LatentWorldModel) -> dict:
     for name, share in shares.items():
         print(f"  {name:<34}{share:>7.1%}")
     return result
-
-
-def matrix_rate() -> float:
-    """Operations per second of a large matrix product in bfloat16."""
-    a, b = torch.randn(2, 2048, 2048).bfloat16()
-    times = []
-    for _ in range(20):
-        began = time.perf_counter()
-        a @ b
-        times.append(time.perf_counter() - began)
-    return 2 * 2048**3 / min(times)
 
 
 def report(title: str, row: dict) -> None:

@@ -23,7 +23,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import torch
-from plain_formulation import fused, Mix, parts, plain_encoder, plain_terms, textbook
+from plain_formulation import fused, matrix_rate, Mix, parts, plain_encoder, plain_precisions, plain_terms, textbook
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
@@ -75,7 +75,8 @@ def main() -> None:
 
 def measure_model(model: str, clips: int, repeats: int, rounds: int) -> dict:
     """All ways of one model, printed and returned."""
-    losses, seconds, cpu_seconds, encoding = measure(("ours", *PLAIN), model, clips, repeats, rounds)
+    plain = [name for name, (_, precision) in PLAIN.items() if precision in plain_precisions()]
+    losses, seconds, cpu_seconds, encoding = measure(("ours", *plain), model, clips, repeats, rounds)
     results = {
         "seconds_per_step": seconds,
         "cpu_seconds_per_step": cpu_seconds,
@@ -260,17 +261,11 @@ def differences(losses: dict[str, dict[str, float]]) -> dict[str, dict[str, floa
 
 
 def floor(way: Way) -> dict[str, float]:
-    """Operations of the matrix products of a step, and the seconds they need at the rate of a large bf16 product."""
+    """Operations of the matrix products of a step, and the seconds they need at the rate of one large product."""
     with FlopCounterMode(display=False) as counter:
         sum(way.terms().values()).backward()
     way.optimizer.zero_grad()
-    a, b = torch.randn(2, 2048, 2048).bfloat16()
-    least = math.inf
-    for _ in range(20):
-        began = time.perf_counter()
-        a @ b
-        least = min(least, time.perf_counter() - began)
-    rate = 2 * 2048**3 / least
+    rate = matrix_rate()
     return {
         "operations_per_step": counter.get_total_flops(),
         "operations_per_second": rate,

@@ -22,9 +22,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import SliceSampler, TensorDictReplayBuffer, TensorStorage
 
+from torchrl_ficreg._device import describe_processor
 from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, OfflineTrajectories
 from torchrl_ficreg.envs.collect import collect_episodes
-from torchrl_ficreg.modules.precision import describe_processor
 
 RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "clip_sampling.json"
 CLIPS, FRAMES, SKIP, LENGTH = 128, 4, 5, 100

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 
 from torchrl_ficreg.envs.cube import CubeArm, CubeExpert, sample_goal, sample_start
-from torchrl_ficreg.envs.cube.poses import CUBE_POSITION, position_reached
+from torchrl_ficreg.envs.cube.tasks import CUBE_POSITION, position_reached
 
 STEPS = 200  # of each published episode
 OFFSET = 25  # steps between the frames of a pair

@@ -1,4 +1,4 @@
-"""Makes test/modules/golden/lewm_*.pt: what the published LeWM code computes from weights and inputs by formula.
+"""Makes test/pretrained/golden/lewm_*.pt: what the published LeWM code computes from weights and inputs by formula.
 
 The published package is no dependency of ours. Steps, in an environment of its own:
 
@@ -27,7 +27,7 @@ import torch
 import transformers
 from torch import nn
 
-GOLDEN = Path(__file__).resolve().parents[1] / "test" / "modules" / "golden"
+GOLDEN = Path(__file__).resolve().parents[1] / "test" / "pretrained" / "golden"
 sys.path.insert(0, str(GOLDEN))
 from formula import CASES, HORIZON, inputs, published_shapes, ROWS, weights  # noqa: E402
 

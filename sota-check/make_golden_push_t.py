@@ -5,7 +5,7 @@ Steps, in an environment of its own (the package's other dependencies are not ne
     python -m venv published && . published/bin/activate
     pip install pygame opencv-python-headless "pymunk==7.3.1" gymnasium shapely loguru numpy
     pip install --no-deps stable-worldmodel==0.0.6
-    python sota-check/make_golden_push_t.py golden test/envs/golden/push_t.npz
+    python sota-check/make_golden_push_t.py golden test/envs/push_t/golden/push_t.npz
     python sota-check/make_golden_push_t.py render states.npz pictures.npz
 
 ``golden`` writes the file that the tests read. ``render`` draws a list of states: it reads ``state`` [N, 7] from one

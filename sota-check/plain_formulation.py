@@ -15,8 +15,8 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from torchrl_ficreg import FICRegLoss
-from torchrl_ficreg.modules.pixels import IMAGENET_MEAN, IMAGENET_STD
-from torchrl_ficreg.modules.precision import bf16_speedup, has_fast_bf16, Precision
+from torchrl_ficreg._device import bf16_speedup, has_fast_bf16, Precision
+from torchrl_ficreg.modules.layers import IMAGENET_MEAN, IMAGENET_STD
 from torchrl_ficreg.objectives.sigreg import standard_normal
 
 Mix = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, bool], torch.Tensor]

@@ -22,8 +22,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from torchrl.modules.planners import CEMPlanner
 
 from torchrl_ficreg import LatentCEMPlanner, LatentGoalEnv, LatentWorldModel, make_world_model, ModelConfig, PlanConfig
-from torchrl_ficreg.modules.memory import keep_freed_memory
-from torchrl_ficreg.modules.precision import autocast, describe_processor
+from torchrl_ficreg._device import autocast, describe_processor, keep_freed_memory
 
 RESULT = Path("planning_speed.json")
 HORIZON, ACTIONS = 5, 2

@@ -11,8 +11,7 @@ import numpy as np
 from torchrl_ficreg.envs.push_t import render, sample_state
 from torchrl_ficreg.envs.push_t.expert import PushTExpert
 from torchrl_ficreg.envs.push_t.geometry import difference, overshoot, to_block
-from torchrl_ficreg.envs.push_t.physics import PushTWorld
-from torchrl_ficreg.envs.push_t.shapes import AGENT_RADIUS, part_distances, WINDOW
+from torchrl_ficreg.envs.push_t.physics import AGENT_RADIUS, part_distances, PushTWorld, WINDOW
 from torchrl_ficreg.envs.push_t.tasks import is_success
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"

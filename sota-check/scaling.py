@@ -19,8 +19,8 @@ from tensordict import TensorDictBase
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchrl_ficreg import FICRegLoss, make_world_model, ModelConfig, SIGReg
+from torchrl_ficreg._device import describe_processor
 from torchrl_ficreg.data import OfflineTrajectories
-from torchrl_ficreg.modules.precision import describe_processor
 from torchrl_ficreg.trainers import OfflineTrainer
 
 RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "scaling.json"

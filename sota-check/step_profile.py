@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from step_cost import matrix_rate, operations_of_step, seconds, take_step, wait_for
 
 from torchrl_ficreg import make_world_model
-from torchrl_ficreg.modules.precision import uses_bf16
+from torchrl_ficreg._device import uses_bf16
 from torchrl_ficreg.trainers import OfflineTrainer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "sota-implementations" / "ficreg"))

@@ -29,8 +29,7 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_ficreg import FICRegLoss, make_world_model, ModelConfig
-from torchrl_ficreg.modules.memory import keep_freed_memory
-from torchrl_ficreg.modules.precision import autocast, describe_processor, Precision
+from torchrl_ficreg._device import autocast, describe_processor, keep_freed_memory, Precision
 
 RESULT = Path("training_speed.json")
 ACTIONS = 2

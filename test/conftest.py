@@ -1,12 +1,84 @@
-"""Fixtures of all tests."""
+"""Fixtures of all tests: world models small enough to be searched exhaustively, or by hand."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
+
+from torchrl_ficreg import LatentWorldModel, make_world_model, ModelConfig
+from torchrl_ficreg.data import ActionStatistics
+
+TINY = {
+    "encoder": "conv",
+    "image_size": 16,
+    "frame_skip": 2,
+    "latent_dim": 6,
+    "history": 3,
+    "conv_channels": (4, 8),
+    "encoder_projector_dim": 12,
+    "predictor_width": 8,
+    "predictor_depth": 2,
+    "predictor_heads": 2,
+    "predictor_dim_head": 4,
+    "predictor_mlp_dim": 16,
+    "predictor_projector_dim": 12,
+    "inverse_hidden_dim": 16,
+}
+
+
+class LinearDynamics(nn.Module):
+    """z' = z + sum of the F actions of the block: the sum of all planned actions is the way travelled."""
+
+    def __init__(self, frame_skip: int, dim: int) -> None:
+        super().__init__()
+        self.history, self.latent_dim, self.action_dim = 1, dim, frame_skip * dim
+        self.position = nn.Parameter(torch.eye(dim).repeat(frame_skip, 1))  # [F * A, D]
+
+    def forward(self, latent, action):
+        return latent + action @ self.position
+
+
+class Corner(nn.Module):
+    """The first two pixels of the red channel, as latents."""
+
+    def forward(self, pixels):
+        return pixels[..., 0, 0, :2].float()
+
+
+@pytest.fixture
+def linear_world() -> Callable[..., LatentWorldModel]:
+    """``linear_world(frame_skip, mean, std)``: the plane, moved in by the z-scored actions."""
+
+    def linear_world(frame_skip: int = 2, mean=(0.0, 0.0), std=(1.0, 1.0)) -> LatentWorldModel:
+        predictor = TensorDictModule(LinearDynamics(frame_skip, 2), ["latent", "action"], ["predicted_latent"])
+        encoder = TensorDictModule(Corner(), ["pixels"], ["latent"])
+        statistics = ActionStatistics(torch.tensor(mean), torch.tensor(std))
+        return LatentWorldModel(encoder, predictor, frame_skip=frame_skip, statistics=statistics).eval()
+
+    return linear_world
+
+
+@pytest.fixture
+def tiny_world() -> Callable[..., LatentWorldModel]:
+    """``tiny_world(action_dim, **sizes)`` in eval mode, all parameters moved off their start values."""
+
+    def tiny_world(action_dim: int = 2, **sizes) -> LatentWorldModel:
+        torch.manual_seed(0)
+        model, _ = make_world_model(ModelConfig(**{**TINY, **sizes}), action_dim)
+        with torch.no_grad():
+            for param in model.parameters():
+                param.add_(0.3 * torch.randn_like(param))
+        return model.eval()
+
+    return tiny_world
 
 
 @pytest.fixture(params=[True, False], ids=["fast_bf16", "slow_bf16"])
 def fast_bf16(request, monkeypatch) -> bool:
     """Whether this processor is taken for one with fast bfloat16 products: a test runs once for each."""
-    monkeypatch.setattr("torchrl_ficreg.modules.precision.has_fast_bf16", lambda device, kind="products": request.param)
+    monkeypatch.setattr("torchrl_ficreg._device.has_fast_bf16", lambda device, kind="products": request.param)
     return request.param

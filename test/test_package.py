@@ -15,25 +15,27 @@ from pathlib import Path
 import pytest
 
 import torchrl_ficreg
-from torchrl_ficreg.envs.gl import how_to_install
+from torchrl_ficreg.envs._gl import how_to_install
 
 ROOT = Path(torchrl_ficreg.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 SOURCES = [*FILES, *sorted((ROOT.parent / "sota-implementations").rglob("*.py"))]
 TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in FILES}
 MODULES = [info.name for info in pkgutil.walk_packages([str(ROOT)], "torchrl_ficreg.")]
-PACKAGES = ["torchrl_ficreg", *(f"torchrl_ficreg.{part}" for part in ("data", "envs", "modules", "objectives"))]
-PACKAGES += ["torchrl_ficreg.trainers", "torchrl_ficreg.evaluation"]
+FOLDERS = ("data", "envs", "modules", "planners", "objectives", "pretrained", "trainers", "evaluation")
+PACKAGES = ["torchrl_ficreg", *(f"torchrl_ficreg.{folder}" for folder in FOLDERS)]
 
-# Who may import whom, inside the package. Nobody else, and never the other way round.
-BELOW = {
-    "data": set(),
-    "envs": {"data"},  # of it the schema alone, see below
-    "modules": {"data"},
-    "objectives": {"data", "modules"},
-    "trainers": {"data", "modules", "objectives"},
-    "evaluation": {"data", "modules", "objectives", "trainers", "envs"},
-}
+# Who may import whom inside the package: a file or folder those of the rows above it, never of its own row or below.
+ORDER = (
+    {"keys", "protocols", "_mujoco", "_utils", "_safe_files", "_device", "_torchrl_compat"},
+    {"distributed"},
+    {"data"},
+    {"envs", "modules"},
+    {"planners", "objectives", "pretrained"},
+    {"trainers"},
+    {"evaluation"},
+)
+RANK = {name: rank for rank, row in enumerate(ORDER) for name in row}
 SIMULATORS = {"torchrl_ficreg.envs.cube": "ogbench", "torchrl_ficreg.envs.reacher": "dm_control"}
 HEAVY = "pymunk mujoco dm_control ogbench h5py hdf5plugin lance safetensors PIL".split()
 HEAVY += "wandb matplotlib imageio pygame transformers".split()
@@ -66,21 +68,19 @@ def test_importing_the_losses_loads_no_simulator_and_no_plotting():
 
 @pytest.mark.parametrize("path", TREES)
 def test_imports_only_go_down(path):
-    part = path.split("/")[0]
+    room = path.removesuffix(".py").split("/")[0]
     for name in imports(TREES[path]):
         assert not name.startswith("."), f"{path}: write the full name instead of {name}"
-        if not name.startswith("torchrl_ficreg") or part not in BELOW:
+        if not name.startswith("torchrl_ficreg.") or room == "__init__":
             continue
-        target = name.split(".")[1] if "." in name else ""
-        if target == "_utils":  # imports nothing of the package
-            continue
-        assert target == part or target in BELOW[part], f"{path} imports {name}"
-        if part == "envs" and target == "data":
-            assert name.startswith("torchrl_ficreg.data.schema."), f"{path} imports {name}: only the schema is shared"
+        target = name.split(".")[1]
+        if target in RANK:  # else a name of the package itself
+            assert target == room or RANK[target] < RANK[room] or RANK[room] == 0 == RANK[target], f"{path} imports {name}"
 
 
-def test_every_part_is_on_the_street():
-    assert {path.name for path in ROOT.iterdir() if path.is_dir() and path.name != "__pycache__"} == set(BELOW)
+def test_every_room_is_on_the_plan():
+    there = {path.stem for path in ROOT.iterdir() if path.suffix == ".py" or path.is_dir()} - {"__init__", "__pycache__"}
+    assert there <= set(RANK) and set(FOLDERS) <= there
 
 
 @pytest.mark.parametrize("name", MODULES)

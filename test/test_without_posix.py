@@ -61,10 +61,10 @@ for module in pkgutil.walk_packages(torchrl_ficreg.__path__, "torchrl_ficreg."):
 from tiny import make_trainer, record
 from torchrl_ficreg._utils import lock_folder
 from torchrl_ficreg.data import EpisodeWriter, OfflineTrajectories
-from torchrl_ficreg.envs.process_env import without_interrupts
+from torchrl_ficreg._utils import without_interrupts
 from torchrl_ficreg.trainers import stop_on_signal
-from torchrl_ficreg.trainers.meter import resident_memory
-from torchrl_ficreg.trainers.rows import CsvRows
+from torchrl_ficreg.trainers.hooks import resident_memory
+from torchrl_ficreg.trainers.loggers import CsvRows
 
 here = Path(sys.argv[1])
 episodes, path = record(10), here / "data"

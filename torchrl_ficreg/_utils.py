@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
 import secrets
+import shutil
+import signal
 import stat
 import time
+import warnings
+from collections.abc import Callable, Collection, Iterator
+from multiprocessing import resource_tracker
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
+
 
 MOST_JSON_BYTES = 64 * 2**20
 
@@ -228,3 +236,137 @@ def _kind(mode: int) -> str:
         stat.S_ISBLK: "a device",
     }
     return next((name for test, name in names.items() if test(mode)), "no regular file")
+
+
+_RESERVE = 256 * 2**20  # most bytes left alone: logs, checkpoints, the rest of the system
+_RESERVED_PART = 0.02  # and no more than this part of a small disk
+
+
+def nearest_folder(path: Path) -> Path:
+    """A folder, or the nearest one there is above it."""
+    place = path.absolute()
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    return place
+
+
+def require_space(path: str | Path, num_bytes: int) -> None:
+    """Checks that a folder, which need not exist yet, can take so many bytes more.
+
+    Args:
+        path: where they will be written.
+        num_bytes: how many.
+
+    Raises:
+        OSError: there is less free space than that and a reserve: 256 MiB, or 2 % of a disk smaller than 13 GB.
+
+    Examples:
+        >>> require_space("somewhere/new", 1)
+    """
+    place = nearest_folder(Path(path).expanduser())
+    total, _, free = shutil.disk_usage(place)
+    reserve = min(_RESERVE, int(total * _RESERVED_PART))
+    if num_bytes + reserve > free:
+        raise OSError(
+            f"{path} needs {num_bytes / 1e6:.1f} MB and a reserve of {reserve / 1e6:.1f} MB, {place} has "
+            f"{free / 1e6:.1f} MB free: record fewer episodes or smaller frames, or write to another disk."
+        )
+
+
+ONE_THREAD = {  # read when a library is loaded, before any code of a worker process could say so
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "LP_NUM_THREADS": "0",  # Mesa's software GL: helpers beside the thread that draws
+}
+
+
+@contextlib.contextmanager
+def environment_variables(variables: dict[str, str]) -> Iterator[None]:
+    """Sets some variables, and puts the former ones back at the end.
+
+    Args:
+        variables: name -> value.
+
+    Examples:
+        >>> with environment_variables({"TORCHRL_FICREG_EXAMPLE": "1"}):
+        ...     "TORCHRL_FICREG_EXAMPLE" in os.environ
+        True
+        >>> "TORCHRL_FICREG_EXAMPLE" in os.environ
+        False
+    """
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+class WorkerTraceback(Exception):
+    """Cause of an exception that was raised in a worker process: the traceback there, as text."""
+
+
+def wait_patiently(
+    signs: Collection[Any], workers: Callable[[], str], *, warn_after: float, timeout: float
+) -> list[Any]:
+    """``multiprocessing.connection.wait`` that warns after a while and gives up in the end.
+
+    Args:
+        signs: connections and sentinels, of which one has to become ready.
+        workers: names the processes waited for.
+        warn_after: seconds until a warning.
+        timeout: seconds until the error.
+
+    Returns:
+        those that are ready.
+
+    Raises:
+        TimeoutError: none became ready in time.
+    """
+    began = time.monotonic()
+    ready = wait(list(signs), min(warn_after, timeout))
+    if not ready and warn_after < timeout:
+        warnings.warn(
+            f"{workers()} has not answered for {warn_after:.0f} s: slow, or stopped? Waiting for up to {timeout:.0f} s.",
+            stacklevel=2,
+        )
+        ready = wait(list(signs), max(0.0, timeout - (time.monotonic() - began)))
+    if not ready:
+        raise TimeoutError(f"{workers()} has not answered for {timeout:.0f} s: look whether it is stopped or stuck.")
+    return ready
+
+
+def out_of_handles(error: BaseException) -> RuntimeError | None:
+    """The error to raise instead of one that stands for too many open files, None for any other."""
+    if getattr(error, "errno", None) in (errno.EMFILE, errno.ENFILE) or "Too many open files" in str(error):
+        return RuntimeError(
+            "too many open files to run the worker processes: raise the limit (ulimit -n 4096), or use fewer workers."
+        )
+    return None
+
+
+@contextlib.contextmanager
+def without_interrupts() -> Iterator[None]:
+    """Processes started meanwhile never receive SIGINT, from their first instant on: Ctrl-C is their parent's to handle.
+
+    A Ctrl-C in the meantime reaches this process at the end.
+
+    Examples:
+        >>> with without_interrupts():
+        ...     signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+        True
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # which unblocks SIGINT when it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by processes
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -23,8 +23,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
+from torchrl_ficreg.distributed import launched
 from torchrl_ficreg.trainers import exit_on_signal, Preempted
-from torchrl_ficreg.trainers.distributed import launched
 
 INTERRUPTED = "interrupted: the same command continues from what is on disk."
 SWEEP_OF_PROCESSES = (  # which would meet a second time at the second job, and hang

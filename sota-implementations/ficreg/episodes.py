@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
-from sharded import recorder, record_shards
+from sharded import record_shards, recorder
 from torchrl import torchrl_logger
 from tqdm import tqdm
 
+from torchrl_ficreg._utils import nearest_folder, require_space
 from torchrl_ficreg.data import EpisodeWriter, estimate_bytes, OfflineTrajectories
+from torchrl_ficreg.data.dataset import split_episodes, SPLITS
 from torchrl_ficreg.data.layout import META_FILE
-from torchrl_ficreg.data.schema import STATE
 from torchrl_ficreg.data.shards import open_store, shard_paths
-from torchrl_ficreg.data.space import nearest_folder, require_space
-from torchrl_ficreg.data.splits import split_episodes, SPLITS
 from torchrl_ficreg.envs import collect_episodes, make_env
 from torchrl_ficreg.envs.base import GOAL_STATE
 from torchrl_ficreg.envs.registry import ENVIRONMENTS
+from torchrl_ficreg.keys import STATE
 
 
 def dataset_path(cfg: DictConfig) -> Path:

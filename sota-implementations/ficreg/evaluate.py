@@ -29,9 +29,9 @@ from utils import (
     write_json,
 )
 
+from torchrl_ficreg._safe_files import checksum_of
 from torchrl_ficreg._utils import read_json, write_atomic
 from torchrl_ficreg.evaluation import save_episodes_gif, StartGoalPairs
-from torchrl_ficreg.modules.safe_files import checksum_of
 from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_model
 
 RESULTS = "results.json"

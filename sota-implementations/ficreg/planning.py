@@ -22,7 +22,7 @@ from torchrl_ficreg import (
     PlanConfig,
 )
 from torchrl_ficreg.modules.goal_policy import CONFIG_FILE, load_goal_policy, WEIGHTS_FILE
-from torchrl_ficreg.modules.planners import SEARCHES
+from torchrl_ficreg.planners import SEARCHES
 
 POLICY_FOLDER = "goal_policy"  # in a run directory
 COSTS = {"goal": GoalDistance, "path": PathDistance}

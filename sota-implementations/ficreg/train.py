@@ -45,8 +45,10 @@ from utils import (
 )
 
 from torchrl_ficreg import InverseDynamicsModel, LatentWorldModel, make_world_model
+from torchrl_ficreg._device import describe_precision
+from torchrl_ficreg._utils import nearest_folder
 from torchrl_ficreg.data.latents import encode_episodes, LatentClips
-from torchrl_ficreg.data.space import nearest_folder
+from torchrl_ficreg.distributed import is_main, process_group, rank, world_size
 from torchrl_ficreg.evaluation import (
     evaluate_mpc,
     latent_distance,
@@ -55,7 +57,6 @@ from torchrl_ficreg.evaluation import (
     save_episodes_gif,
     StartGoalPairs,
 )
-from torchrl_ficreg.modules.precision import describe_precision
 from torchrl_ficreg.trainers import (
     checkpoint_components,
     load_world_model,
@@ -69,7 +70,6 @@ from torchrl_ficreg.trainers import (
     TolerantLogger,
 )
 from torchrl_ficreg.trainers.checkpoint import check_room
-from torchrl_ficreg.trainers.distributed import is_main, process_group, rank, world_size
 from torchrl_ficreg.trainers.offline import METRICS
 
 NOT_THE_TRAINERS = ("batch_size", "checkpoint_activations")  # of optim: settings of the dataset, and of the networks

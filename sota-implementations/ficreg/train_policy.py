@@ -23,13 +23,14 @@ from tqdm import trange
 from utils import claim_folder, encoder_of, flatten, get_device, settings_of_card, versions, write_json
 
 from torchrl_ficreg import LatentWorldModel
+from torchrl_ficreg._device import autocast, check_precision
+from torchrl_ficreg._safe_files import require_safetensors
 from torchrl_ficreg._utils import read_json
 from torchrl_ficreg.data.latents import BLOCKS, encode_episodes, GoalRows
-from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
+from torchrl_ficreg.keys import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.goal_policy import GoalPolicy, load_goal_policy, save_goal_policy
-from torchrl_ficreg.modules.precision import autocast, check_precision
-from torchrl_ficreg.modules.safe_files import require_safetensors
-from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_model, ModelCard, WarmupCosine
+from torchrl_ficreg.pretrained import ModelCard
+from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_model, WarmupCosine
 
 METRICS = "metrics.json"
 # Where things are and how fast they go: settings that make no other policy.

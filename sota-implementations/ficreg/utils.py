@@ -35,19 +35,20 @@ from torchrl_ficreg import (
     PLDMLoss,
     SIGReg,
 )
+from torchrl_ficreg._device import autocast, check_precision, describe_processor, Precision
 from torchrl_ficreg._utils import write_atomic
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.data.frames import check_frame_format
-from torchrl_ficreg.data.schema import STATE
+from torchrl_ficreg.distributed import launched, world_size
 from torchrl_ficreg.envs import make_env
 from torchrl_ficreg.envs.registry import find_entry
-from torchrl_ficreg.evaluation import Evaluation, evaluate_mpc, StartGoalPairs, UniformPolicy
+from torchrl_ficreg.evaluation import evaluate_mpc, Evaluation, StartGoalPairs, UniformPolicy
+from torchrl_ficreg.keys import STATE
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
-from torchrl_ficreg.modules.precision import autocast, check_precision, describe_processor, Precision
-from torchrl_ficreg.modules.recompute import checkpoint_activations
-from torchrl_ficreg.trainers import CoefficientSchedule, LatentAlarm, ModelCard, OfflineTrainer, Refinement
-from torchrl_ficreg.trainers.distributed import launched, world_size
-from torchrl_ficreg.trainers.parallel import check_processes
+from torchrl_ficreg.modules.transformer import checkpoint_activations
+from torchrl_ficreg.pretrained import ModelCard
+from torchrl_ficreg.trainers import CoefficientSchedule, LatentAlarm, OfflineTrainer, Refinement
+from torchrl_ficreg.trainers.stepper import check_processes
 
 EASY_START, EASY_RANDOM = 0.2, 0.5  # shares of pairs above which an evaluation tells little
 MOST_COUNT, MOST_WORKERS = 10**8, 1024  # of anything counted in a configuration; of processes

@@ -20,7 +20,7 @@ import pytest
 
 from torchrl_ficreg._utils import lock_file
 from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, OfflineTrajectories
-from torchrl_ficreg.data.layout import IndexEntry, checksums, sync_directory
+from torchrl_ficreg.data.layout import checksums, IndexEntry, sync_directory
 from torchrl_ficreg.data.shards import open_store, shard_paths
 
 DELETED = object()

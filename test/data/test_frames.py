@@ -24,9 +24,15 @@ import pytest
 import torch
 
 from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, estimate_bytes, OfflineTrajectories
-from torchrl_ficreg.data.frames import check_frame_format, encode_frames, ImageFrames, RawFrames
-from torchrl_ficreg.data.recycle import Recycler
-from torchrl_ficreg.data.threads import default_threads, run_split
+from torchrl_ficreg.data.frames import (
+    check_frame_format,
+    default_threads,
+    encode_frames,
+    ImageFrames,
+    RawFrames,
+    Recycler,
+    run_split,
+)
 
 META = {"env": "two_room", "seed": 0}
 LENGTHS = [20, 31, 25]

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchrl_ficreg.envs import ENVIRONMENTS, make_env
-from torchrl_ficreg.envs.gl import gl_works
+from torchrl_ficreg.envs._gl import gl_works
 
 COPIERS = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 SETTINGS = {"push_t": [{}, {"legacy_restore": True}]}

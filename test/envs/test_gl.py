@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchrl_ficreg.envs import gl
+from torchrl_ficreg.envs import _gl as gl
 
 if importlib.util.find_spec("mujoco") is None:
     pytest.skip("MuJoCo is not installed: pip install 'torchrl_ficreg[envs]'", allow_module_level=True)
@@ -42,7 +42,7 @@ def without(library):
 """
 LOAD = f"""
 import ctypes, os, sys
-from torchrl_ficreg.envs import gl
+from torchrl_ficreg.envs import _gl as gl
 def scene():
     mujoco = gl.import_mujoco()
     model = mujoco.MjModel.from_xml_string({SCENE!r})

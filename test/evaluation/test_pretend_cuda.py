@@ -9,7 +9,7 @@ from scenes import same_room_pairs
 
 from torchrl_ficreg import FICRegLoss, GoalPolicy, make_world_model, ModelConfig, MPCPolicy
 from torchrl_ficreg.evaluation import evaluate_mpc
-from torchrl_ficreg.modules.planners import common, SEARCHES
+from torchrl_ficreg.planners import base as common, SEARCHES
 
 SIZES = ModelConfig(
     encoder="conv",

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_ficreg import ConvEncoder, KeypointEncoder, ViTEncoder
 from torchrl_ficreg.modules.keypoints import spatial_softmax
-from torchrl_ficreg.modules.pixels import IMAGENET_MEAN, IMAGENET_STD, PixelNormalizer
+from torchrl_ficreg.modules.layers import IMAGENET_MEAN, IMAGENET_STD, PixelNormalizer
 
 BUILD = {
     "conv": lambda **kwargs: ConvEncoder(image_size=16, channels=(4, 8), projector_dim=12, latent_dim=6, **kwargs),

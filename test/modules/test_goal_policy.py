@@ -8,8 +8,8 @@ episodes. Saved and loaded it is the same to the last bit, and it works with no 
 from __future__ import annotations
 
 import json
-import os
 import math
+import os
 
 import numpy as np
 import pytest
@@ -21,8 +21,7 @@ from torchrl.objectives import BCLoss
 
 from torchrl_ficreg.data import ActionStatistics, OfflineTrajectories
 from torchrl_ficreg.data.latents import encode_episodes, GoalRows
-from torchrl_ficreg.modules.goal_network import GoalNetwork
-from torchrl_ficreg.modules.goal_policy import GoalPolicy, load_goal_policy, save_goal_policy
+from torchrl_ficreg.modules.goal_policy import GoalNetwork, GoalPolicy, load_goal_policy, save_goal_policy
 
 
 @pytest.fixture

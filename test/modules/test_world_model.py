@@ -89,7 +89,7 @@ def test_a_plain_module_and_a_frame_skip_that_is_none_are_refused():
 
 def test_left_to_choose_a_planner_does_not_cast_a_network_of_ones_own(monkeypatch):
     """Wherever bfloat16 is fast: it may not bear the rounding, or, as here, the cast. A network of the package does."""
-    monkeypatch.setattr("torchrl_ficreg.modules.planners.common.uses_bf16", lambda device, chosen: chosen != "fp32")
+    monkeypatch.setattr("torchrl_ficreg.planners.base.uses_bf16", lambda device, chosen: chosen != "fp32")
     settings = {"num_candidates": 8, "num_elites": 2, "iterations": 2}
     model = with_predictor(TensorDictModule(Own(**SIZES), ["latent", "action"], ["predicted_latent"]))
     plans = [

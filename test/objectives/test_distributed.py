@@ -19,8 +19,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from torchrl_ficreg import SIGReg
-from torchrl_ficreg.modules.batch_norm import GlobalBatchNorm1d
-from torchrl_ficreg.objectives.gather import gather_clips
+from torchrl_ficreg.distributed import gather_clips
+from torchrl_ficreg.modules.layers import GlobalBatchNorm1d
 from torchrl_ficreg.trainers import LatentAlarm
 
 TIMES, DIM, DTYPE = 3, 5, torch.float64

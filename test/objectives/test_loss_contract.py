@@ -22,7 +22,7 @@ from torchrl_ficreg import (
     LeWMLoss,
     SIGReg,
 )
-from torchrl_ficreg.modules.pixels import check_finite
+from torchrl_ficreg.modules.layers import check_finite
 
 
 def values(loss, *args, **kwargs):

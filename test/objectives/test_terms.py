@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchrl_ficreg import CovariancePenalty, TemporalStraightness, VarianceHinge
-from torchrl_ficreg.objectives.judge import inverse_error, Recovered, trust
+from torchrl_ficreg.objectives.inverse_terms import inverse_error, Recovered, trust
 from torchrl_ficreg.objectives.terms import (
     gaussian_nll,
     hinge_std,

@@ -7,7 +7,7 @@ import json
 import imageio.v3 as imageio
 import pytest
 
-from torchrl_ficreg.envs.gl import gl_works
+from torchrl_ficreg.envs._gl import gl_works
 
 ACTION_DIM = {"push_t": 2, "reacher": 2, "cube": 5}
 EPISODES = 10

@@ -25,7 +25,8 @@ import yaml
 from omegaconf import OmegaConf
 
 from torchrl_ficreg.data import EpisodeWriter
-from torchrl_ficreg.trainers import ModelCard, Preempted
+from torchrl_ficreg.pretrained import ModelCard
+from torchrl_ficreg.trainers import Preempted
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "sota-implementations" / "ficreg"
 RUN = "runs/two_room_cpu_ficreg_seed0"

@@ -14,8 +14,8 @@ import torch
 import torch.distributed as dist
 from tiny import make_data, make_trainer, SIZES, weights
 
+from torchrl_ficreg.distributed import process_group
 from torchrl_ficreg.trainers import OfflineTrainer
-from torchrl_ficreg.trainers.distributed import process_group
 
 WORLD = 2
 STRATEGIES = ("ddp", "fsdp")

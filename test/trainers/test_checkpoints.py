@@ -23,10 +23,9 @@ from torchrl.data import ListStorage, ReplayBuffer
 
 from torchrl_ficreg import LatentCEMPlanner, make_world_model, ModelConfig, MPCPolicy, PlanConfig
 from torchrl_ficreg.data import OfflineTrajectories
-from torchrl_ficreg.modules.pretrained import save_pretrained
-from torchrl_ficreg.trainers import checkpoint_components, find_checkpoint, load_world_model, ModelCard
-from torchrl_ficreg.trainers.checkpoint import latest_whole
-from torchrl_ficreg.trainers.rng import RandomState
+from torchrl_ficreg.pretrained import ModelCard, save_pretrained
+from torchrl_ficreg.trainers import checkpoint_components, find_checkpoint, load_world_model
+from torchrl_ficreg.trainers.checkpoint import latest_whole, RandomState
 from torchrl_ficreg.trainers.stream import ReplayStream
 
 

@@ -17,10 +17,10 @@ from ranks import make_part, num_moments, STILL, STRATEGIES, work, WORLD
 from tiny import make_data, make_trainer, same, weights
 
 from torchrl_ficreg import make_world_model
+from torchrl_ficreg.distributed import any_process, average, from_main, is_main, process_group, world_size
 from torchrl_ficreg.objectives import PLDMLoss
 from torchrl_ficreg.trainers import LatentAlarm, OfflineTrainer
-from torchrl_ficreg.trainers.distributed import any_process, average, from_main, is_main, process_group, world_size
-from torchrl_ficreg.trainers.parallel import check_processes
+from torchrl_ficreg.trainers.stepper import check_processes
 
 # BatchNorm takes a shift of its input away again, so these have a gradient of rounding noise, and Adam makes whole steps
 # of it. No output depends on them, but in eval mode the running mean lags a little behind.

@@ -10,8 +10,8 @@ import torch
 from tiny import make_data, make_trainer, SIZES
 
 from torchrl_ficreg import LeWMLoss, make_world_model, ViTEncoder
-from torchrl_ficreg.modules import recompute
-from torchrl_ficreg.modules.recompute import checkpoint_activations
+from torchrl_ficreg.modules import transformer as recompute
+from torchrl_ficreg.modules.transformer import checkpoint_activations
 from torchrl_ficreg.trainers import OfflineTrainer
 
 

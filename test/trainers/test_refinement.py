@@ -9,7 +9,7 @@ from tiny import make_data, SIZES
 
 from torchrl_ficreg import FICRegLoss, LeWMLoss, make_world_model
 from torchrl_ficreg.data.latents import encode_episodes, LatentClips
-from torchrl_ficreg.data.schema import ACTION, LATENT, PIXELS
+from torchrl_ficreg.keys import ACTION, LATENT, PIXELS
 from torchrl_ficreg.trainers import NoRegularizer, on_frozen_latents, Refinement
 
 

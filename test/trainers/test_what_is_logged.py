@@ -14,7 +14,7 @@ from torchrl.checkpoint import Checkpoint
 
 from torchrl_ficreg import TemporalStraightness
 from torchrl_ficreg.trainers import find_checkpoint, LatentAlarm, SuccessRate
-from torchrl_ficreg.trainers.rows import CsvRows
+from torchrl_ficreg.trainers.loggers import CsvRows
 
 
 def rows(run_dir, split: str = "train") -> list[dict[str, str]]:

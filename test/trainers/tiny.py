@@ -11,7 +11,8 @@ import torch
 
 from torchrl_ficreg import FICRegLoss, LeWMLoss, make_world_model, ModelConfig
 from torchrl_ficreg.data import OfflineTrajectories
-from torchrl_ficreg.trainers import checkpoint_components, ModelCard, OfflineTrainer, stop_on_signal
+from torchrl_ficreg.pretrained import ModelCard
+from torchrl_ficreg.trainers import checkpoint_components, OfflineTrainer, stop_on_signal
 
 SIZES = ModelConfig(
     encoder="conv",

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from torchrl.data.datasets import register_dataset
 
-from torchrl_ficreg.data.clips import clip_length, ClipStorage
-from torchrl_ficreg.data.dataset import OfflineTrajectories
-from torchrl_ficreg.data.layout import estimate_bytes
-from torchrl_ficreg.data.replay import SeekableReplayBuffer
-from torchrl_ficreg.data.sampler import ClipSampler
-from torchrl_ficreg.data.schema import check_episode
-from torchrl_ficreg.data.splits import split_episodes
-from torchrl_ficreg.data.statistics import ActionStatistics
+from torchrl_ficreg.data.action_statistics import ActionStatistics
+from torchrl_ficreg.data.clips import clip_length, ClipSampler, ClipStorage
+from torchrl_ficreg.data.dataset import OfflineTrajectories, SeekableReplayBuffer, split_episodes
+from torchrl_ficreg.data.layout import check_episode, estimate_bytes
 from torchrl_ficreg.data.store import EpisodeStore
 from torchrl_ficreg.data.writer import EpisodeWriter
 

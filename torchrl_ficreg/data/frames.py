@@ -7,13 +7,124 @@ everything made from frames (batches, checksums, the fingerprint of a dataset) i
 from __future__ import annotations
 
 import io
+import os
+import weakref
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from math import prod
 from typing import Any, get_args, Literal
 
 import numpy as np
 
-from torchrl_ficreg.data.recycle import Recycler
-from torchrl_ficreg.data.threads import default_threads, run_split
+
+class Recycler:
+    """Hands out uninitialised byte arrays and takes their memory back when the last user has dropped them.
+
+    The kernel clears every page before a process sees it, which takes almost as long as filling a batch of clips (77 MB
+    at 3 x 224 x 224) with frames, and the allocator gives blocks of that size back at once. So the last few blocks
+    are kept. An array is the caller's for as long as he, or a view or a tensor made from it, holds on to it: only
+    the destruction of the array puts its memory on the shelf.
+
+    Keyword Args:
+        keep: blocks that wait for their next use; the memory this costs is ``keep`` times one array.
+        smallest: bytes below which the allocator does as well.
+
+    Examples:
+        >>> recycler = Recycler(smallest=1)
+        >>> first = recycler.empty((2, 3))
+        >>> address, view = first.ctypes.data, first[0]
+        >>> del first
+        >>> recycler.empty((2, 3)).ctypes.data == address  # the view still looks at it
+        False
+        >>> del view
+        >>> recycler.empty((2, 3)).ctypes.data == address
+        True
+    """
+
+    def __init__(self, *, keep: int = 2, smallest: int = 1 << 20) -> None:
+        self.smallest = smallest
+        # Appending and popping are atomic: memory comes back in whichever thread drops it, even amid a collection
+        # of garbage, where waiting for a lock could be waiting for oneself.
+        self._shelf: deque[np.ndarray] = deque(maxlen=keep)
+
+    def empty(self, shape: tuple[int, ...]) -> np.ndarray:
+        """An uninitialised, contiguous, writable uint8 array."""
+        size = prod(shape)
+        if size < self.smallest:
+            return np.empty(shape, np.uint8)
+        memory = self._take(size)
+        # Views of a view refer to its owner, not to it, unless the owner is no array: hence the memoryview. With it
+        # every view keeps `loan` alive.
+        loan = np.frombuffer(memoryview(memory), np.uint8)
+        weakref.finalize(loan, self._shelf.append, memory).atexit = False
+        return loan.reshape(shape)
+
+    def _take(self, size: int) -> np.ndarray:
+        while self._shelf:
+            try:
+                memory = self._shelf.pop()
+            except IndexError:  # another thread was faster
+                break
+            if memory.size == size:  # others belong to a batch size that is not asked for any more
+                return memory
+        return np.empty(size, np.uint8)
+
+
+MOST_THREADS = 8  # more readers than this only take cores from the training step
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+
+# A forked child has the pools but not their threads, and would wait for them for ever.
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
+    os.register_at_fork(after_in_child=_pools.clear)
+
+
+def default_threads() -> int:
+    """The cores this process may use, at most eight.
+
+    Examples:
+        >>> 1 <= default_threads() <= 8
+        True
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, MOST_THREADS)
+
+
+def run_split(work: Callable[[int, int], None], count: int, *, num_threads: int, smallest: int = 1) -> None:
+    """Calls ``work(start, stop)`` until ``range(count)`` is covered, on several threads where that pays.
+
+    Args:
+        work: handles the items ``start`` to ``stop - 1``; pieces never overlap. It must not call this function.
+        count: number of items.
+
+    Keyword Args:
+        num_threads: most threads. With 1, or with too few items, the work is done in the calling thread.
+        smallest: items below which a piece is not worth handing over.
+
+    Raises:
+        whatever ``work`` raises: of several errors, that of the first piece.
+
+    Examples:
+        >>> squares = [0] * 5
+        >>> def work(start, stop):
+        ...     for item in range(start, stop):
+        ...         squares[item] = item**2
+        >>> run_split(work, 5, num_threads=2)
+        >>> squares
+        [0, 1, 4, 9, 16]
+    """
+    pieces = min(num_threads * 4, count // smallest)  # four per thread, as images differ in the time they take
+    if num_threads <= 1 or pieces <= 1:
+        return work(0, count)
+    if num_threads not in _pools:
+        _pools[num_threads] = ThreadPoolExecutor(num_threads, thread_name_prefix="frames")
+    bounds = [count * piece // pieces for piece in range(pieces + 1)]
+    futures = [_pools[num_threads].submit(work, *piece) for piece in zip(bounds[:-1], bounds[1:])]
+    errors = [error for error in [future.exception() for future in futures] if error is not None]
+    if errors:
+        raise errors[0]
+
 
 FrameFormat = Literal["raw", "webp", "png"]
 FRAME_FORMATS = get_args(FrameFormat)

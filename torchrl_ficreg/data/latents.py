@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from tqdm import tqdm
 
 from torchrl_ficreg.data.dataset import OfflineTrajectories
-from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT, PIXELS
+from torchrl_ficreg.keys import ACTION, GOAL_LATENT, LATENT, PIXELS
 
 BLOCKS = "blocks"
 

@@ -34,7 +34,7 @@ import numpy as np
 
 from torchrl_ficreg._utils import MOST_JSON_BYTES, read_bytes, require_regular_file, write_atomic
 from torchrl_ficreg.data.frames import frame_bytes, FRAME_FORMATS, FrameFormat
-from torchrl_ficreg.data.schema import ACTION, PIXELS, STATE
+from torchrl_ficreg.keys import ACTION, PIXELS, STATE
 
 FORMAT = "torchrl_ficreg.episodes"
 # Version 2 has compressed frames. Raw datasets stay at version 1: code that knows nothing else reads them as before.
@@ -341,3 +341,44 @@ def sync_directory(path: Path) -> None:
             raise
     finally:
         os.close(descriptor)
+
+
+def check_episode(episode: dict[str, np.ndarray]) -> int:
+    """Checks one recorded episode against the key contract.
+
+    Args:
+        episode: arrays ``pixels`` [L, 3, H, W] uint8, ``action`` [L, A] float32 and ``state`` [L, S] float64
+            (S = 0 where there is none), where row t holds the frame, the action that leads from it, and the state it was drawn from.
+
+    Returns:
+        L, the number of steps.
+
+    Raises:
+        KeyError: a key is missing or unknown.
+        TypeError: a value is not a numpy array.
+        ValueError: a shape (an empty one too), a dtype, a non-finite value, or an action at the last step.
+    """
+    expected = {PIXELS: (4, np.uint8), ACTION: (2, np.float32), STATE: (2, np.float64)}
+    if set(episode) != set(expected):
+        missing, surplus = sorted(set(expected) - set(episode)), sorted(set(episode) - set(expected))
+        raise KeyError(f"an episode holds exactly {sorted(expected)}: missing {missing}, not wanted {surplus}.")
+    for key, value in episode.items():
+        if not isinstance(value, np.ndarray):
+            raise TypeError(f"{key!r} must be a numpy array, got a {type(value).__name__}: convert it before writing.")
+    lengths = {key: len(value) for key, value in episode.items()}
+    if len(set(lengths.values())) != 1 or min(lengths.values()) < 2:
+        raise ValueError(f"an episode needs at least 2 steps, equally many of each key, got {lengths}.")
+    for key, (ndim, dtype) in expected.items():
+        value = episode[key]
+        if value.ndim != ndim or value.dtype != dtype:
+            want = f"{ndim}-d {np.dtype(dtype).name}"
+            raise ValueError(f"{key!r} must be {want}, got {value.ndim}-d {value.dtype}: convert it before writing.")
+        if not value.size and (key != STATE or value.shape[1:] != (0,)):  # data without a simulator have no state
+            raise ValueError(f"{key!r} must hold at least one number per step, got shape {value.shape}.")
+        if key != PIXELS and not np.isfinite(value).all():
+            raise ValueError(f"{key!r} holds a NaN or an infinity: drop those steps before writing.")
+    if episode[PIXELS].shape[1] != 3:
+        raise ValueError(f"'pixels' must be [L, 3, H, W], got {episode[PIXELS].shape}: move the channel axis first.")
+    if np.any(episode[ACTION][-1]):
+        raise ValueError("the last step leads nowhere: its action must be zero, or the actions are shifted by one.")
+    return len(episode[PIXELS])

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from torchrl_ficreg.data.layout import Header, IndexEntry, META_FILE, read_header, read_index
-from torchrl_ficreg.data.schema import PIXELS
 from torchrl_ficreg.data.store import EpisodeStore, Verify
+from torchrl_ficreg.keys import PIXELS
 
 SHARD = "shard-{}"
 SHARD_NUMBER, NUM_SHARDS = "shard", "shards"  # what a shard notes about itself, from 0, and about all

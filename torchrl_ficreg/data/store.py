@@ -16,6 +16,7 @@ from torchrl_ficreg._utils import BINARY, NO_WAIT
 from torchrl_ficreg.data.frames import ImageFrames, RawFrames
 from torchrl_ficreg.data.layout import (
     BLOB,
+    check_episode,
     check_sizes,
     checksums,
     COLLECT_HINT,
@@ -29,7 +30,7 @@ from torchrl_ficreg.data.layout import (
     read_index,
     read_offsets,
 )
-from torchrl_ficreg.data.schema import ACTION, check_episode, PIXELS, STATE
+from torchrl_ficreg.keys import ACTION, PIXELS, STATE
 
 Verify = Literal["ends", "full", "none"]
 

@@ -14,6 +14,7 @@ from torchrl_ficreg._utils import BINARY, lock_file, NO_FOLLOW, read_bytes, requ
 from torchrl_ficreg.data.frames import check_frame_format, encode_frames, FrameFormat
 from torchrl_ficreg.data.layout import (
     BLOB,
+    check_episode,
     checksums,
     DTYPES,
     Header,
@@ -28,8 +29,8 @@ from torchrl_ficreg.data.layout import (
     sync_directory,
     write_header,
 )
-from torchrl_ficreg.data.schema import check_episode, PIXELS
 from torchrl_ficreg.data.store import EpisodeStore
+from torchrl_ficreg.keys import PIXELS
 
 
 class EpisodeWriter:
@@ -146,7 +147,7 @@ class EpisodeWriter:
         """Writes and commits one episode.
 
         Args:
-            episode: see :func:`~torchrl_ficreg.data.schema.check_episode`; row shapes as in the first episode.
+            episode: see :func:`~torchrl_ficreg.data.layout.check_episode`; row shapes as in the first episode.
 
         Returns:
             The id of the episode, from 1.

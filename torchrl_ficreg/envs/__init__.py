@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from torchrl_ficreg.envs.base import GoalEnv
 from torchrl_ficreg.envs.collect import collect_episodes
-from torchrl_ficreg.envs.factory import make_env
-from torchrl_ficreg.envs.registry import ENVIRONMENTS, EnvEntry, Expert, register_all
+from torchrl_ficreg.envs.make import make_env
+from torchrl_ficreg.envs.registry import EnvEntry, ENVIRONMENTS, Expert, register_all
 
 register_all()
 

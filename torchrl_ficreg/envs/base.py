@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from torchrl_ficreg.data.schema import GOAL_PIXELS, PIXELS, STATE, SUCCESS
+from torchrl_ficreg.keys import GOAL_PIXELS, PIXELS, STATE, SUCCESS
 
 GOAL_STATE = "goal_state"
 _LARGEST_ACTION = 100.0  # a hundred times what all environments ask for; physics would leave their states beyond

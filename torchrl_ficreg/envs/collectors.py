@@ -25,10 +25,10 @@ from torchrl.collectors import BaseCollector, MultiAsyncCollector
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_ficreg.data.schema import ACTION, DONE, EPISODE, PIXELS, STATE, SUCCESS
+from torchrl_ficreg._utils import without_interrupts
 from torchrl_ficreg.envs.base import GOAL_STATE
 from torchrl_ficreg.envs.collect import EpisodeRecorder
-from torchrl_ficreg.envs.process_env import without_interrupts
+from torchrl_ficreg.keys import ACTION, DONE, EPISODE, PIXELS, STATE, SUCCESS
 
 CollectorKind = Literal["async", "ray", "submitit"]
 EXPERT_ACTION, SHARD, AT_GOAL = "expert_action", "shard", "at_goal"

@@ -1,10 +1,9 @@
 """Judging a world model: by planning on frozen start-goal pairs, and by the shape of its latent space."""
 
-from torchrl_ficreg.evaluation.distance import DistanceProfile, latent_distance
+from torchrl_ficreg.evaluation.metrics import DistanceProfile, latent_distance, rank_correlation, wilson_interval
 from torchrl_ficreg.evaluation.mpc import evaluate_mpc, Evaluation, UniformPolicy
 from torchrl_ficreg.evaluation.pairs import StartGoalPairs
-from torchrl_ficreg.evaluation.report import plot_latent_distance, plot_learning_curve, save_episodes_gif
-from torchrl_ficreg.evaluation.statistics import rank_correlation, wilson_interval
+from torchrl_ficreg.evaluation.plots import plot_latent_distance, plot_learning_curve, save_episodes_gif
 
 __all__ = [
     "DistanceProfile",

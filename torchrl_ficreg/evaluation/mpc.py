@@ -14,12 +14,12 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
-from torchrl_ficreg.data.schema import ACTION, GOAL_PIXELS, PIXELS, SUCCESS
 from torchrl_ficreg.envs import make_env
+from torchrl_ficreg.evaluation.metrics import wilson_interval
 from torchrl_ficreg.evaluation.pairs import StartGoalPairs
-from torchrl_ficreg.evaluation.statistics import wilson_interval
-from torchrl_ficreg.modules.planners.common import PLAN_SEED
-from torchrl_ficreg.modules.planners.mpc import MPCPolicy
+from torchrl_ficreg.keys import ACTION, GOAL_PIXELS, PIXELS, SUCCESS
+from torchrl_ficreg.planners.base import PLAN_SEED
+from torchrl_ficreg.planners.mpc import MPCPolicy
 
 
 class UniformPolicy(TensorDictModuleBase):

@@ -12,7 +12,7 @@ import numpy as np
 
 from torchrl_ficreg._utils import read_json, write_atomic
 from torchrl_ficreg.data import OfflineTrajectories
-from torchrl_ficreg.data.schema import STATE
+from torchrl_ficreg.keys import STATE
 
 
 @dataclass(frozen=True)

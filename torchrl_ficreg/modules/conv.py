@@ -7,10 +7,9 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_ficreg.data.schema import LATENT, PIXELS
-from torchrl_ficreg.modules.pixels import channels_last, PixelNormalizer, restore_lead
-from torchrl_ficreg.modules.precision import convolution_region
-from torchrl_ficreg.modules.projector import Projector
+from torchrl_ficreg._device import convolution_region
+from torchrl_ficreg.keys import LATENT, PIXELS
+from torchrl_ficreg.modules.layers import channels_last, PixelNormalizer, Projector, restore_lead
 
 
 class ConvNetwork(nn.Module):
@@ -59,7 +58,7 @@ class ConvEncoder(TensorDictModule):
         **network: see :class:`ConvNetwork`.
 
     Raises:
-        TypeError, ValueError: see :class:`~torchrl_ficreg.modules.pixels.PixelNormalizer`.
+        TypeError, ValueError: see :class:`~torchrl_ficreg.modules.layers.PixelNormalizer`.
 
     Examples:
         >>> import torch

@@ -9,7 +9,7 @@ from tensordict import is_tensor_collection, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 
-from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT, PIXELS, PREDICTED_LATENT
+from torchrl_ficreg.keys import ACTION, GOAL_LATENT, LATENT, PIXELS, PREDICTED_LATENT
 
 NEXT_LATENT = "next_latent"  # contract name of the latent a transition leads to; ("next", "latent") is the same
 _MARKS = {NEXT_LATENT: "next", GOAL_LATENT: "goal"}  # what tells the key of such a latent from that of another one

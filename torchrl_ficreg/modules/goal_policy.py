@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
+from torch import nn
 
-from torchrl_ficreg.data.schema import ACTION, GOAL_LATENT, LATENT
-from torchrl_ficreg.modules.feed import sort_keys
-from torchrl_ficreg.modules.goal_network import GoalNetwork
-from torchrl_ficreg.modules.safe_files import (
+from torchrl_ficreg._safe_files import (
     check_kinds,
     check_shapes,
     check_sizes,
@@ -24,7 +23,80 @@ from torchrl_ficreg.modules.safe_files import (
     require_safetensors,
     save_model,
 )
+from torchrl_ficreg.keys import ACTION, GOAL_LATENT, LATENT
+from torchrl_ficreg.modules.feed import sort_keys
 from torchrl_ficreg.modules.world_model import LatentWorldModel
+
+
+_SMALLEST_STD = 1e-6  # below it a latent dimension counts as constant
+
+
+class GoalNetwork(nn.Module):
+    """Hidden layers with LayerNorm on a standardised latent and goal latent.
+
+    No BatchNorm: an imagined latent is answered as a real one is, alone or in company.
+
+    Args:
+        latent_dim: D.
+        action_dim: width F * A of an action block.
+        hidden_dim: of each hidden layer.
+        depth: hidden layers.
+    """
+
+    def __init__(self, latent_dim: int, action_dim: int, hidden_dim: int = 512, depth: int = 3) -> None:
+        super().__init__()
+        sizes = {"latent_dim": latent_dim, "action_dim": action_dim, "hidden_dim": hidden_dim, "depth": depth}
+        small = [f"{name}={size}" for name, size in sizes.items() if size < 1]
+        if small:
+            raise ValueError(f"sizes of a goal policy must be positive, got {', '.join(small)}.")
+        self.latent_dim, self.action_dim, self.hidden_dim, self.depth = latent_dim, action_dim, hidden_dim, depth
+        self.register_buffer("latent_mean", torch.zeros(latent_dim))
+        self.register_buffer("latent_std", torch.ones(latent_dim))
+        layers: list[nn.Module] = []
+        for width in [2 * latent_dim] + [hidden_dim] * (depth - 1):
+            layers += [nn.Linear(width, hidden_dim), nn.LayerNorm(hidden_dim), nn.GELU()]
+        self.layers = nn.Sequential(*layers, nn.Linear(hidden_dim, action_dim))
+
+    def forward(self, latent: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+        """Latents [..., D] and goal latents [..., D] -> action blocks [..., F * A], z-scored.
+
+        Raises:
+            ValueError: other shapes.
+        """
+        if latent.shape != goal.shape or latent.shape[-1] != self.latent_dim:
+            raise ValueError(
+                f"the policy reads latents and goal latents [..., {self.latent_dim}] of one shape, got "
+                f"{list(latent.shape)} and {list(goal.shape)}: was it trained for another world model?"
+            )
+        both = torch.stack([latent, goal], dim=-2)  # [..., 2, D]
+        return self.layers(((both - self.latent_mean) / self.latent_std).flatten(-2))
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The arguments that build the same network."""
+        return {name: getattr(self, name) for name in ("latent_dim", "action_dim", "hidden_dim", "depth")}
+
+    @torch.no_grad()
+    def standardize_by(self, latent: torch.Tensor) -> None:
+        """Takes mean and standard deviation of its input from training latents [N, D].
+
+        A dimension that never changes is only centred.
+
+        Raises:
+            ValueError: another width, fewer than two latents, or one that is not finite.
+        """
+        if latent.ndim != 2 or len(latent) < 2 or latent.shape[1] != self.latent_dim:
+            raise ValueError(f"expected at least 2 latents [N, {self.latent_dim}], got {list(latent.shape)}.")
+        rows = latent if latent.dtype in (torch.float32, torch.float64) else latent.float()
+        rows = rows.cpu().numpy().astype(np.float64)  # summed in float64 by NumPy: MPS has none
+        with np.errstate(invalid="ignore"):  # told below
+            mean, std = rows.mean(0), rows.std(0)  # [D], [D]
+        if not np.isfinite([mean, std]).all():
+            raise ValueError("the training latents hold a NaN or an infinity: leave those rows out.")
+        std[std < _SMALLEST_STD] = 1
+        for buffer, value in ((self.latent_mean, mean), (self.latent_std, std)):
+            buffer.copy_(torch.tensor(value.tolist(), dtype=buffer.dtype))
+
 
 FORMAT, VERSION = "torchrl_ficreg.goal_policy", 1
 CONFIG_FILE, WEIGHTS_FILE = "policy.json", "policy.safetensors"
@@ -41,7 +113,7 @@ class GoalPolicy(TensorDictModule):
     forward by a world model, see :meth:`imagine`, it proposes whole plans to a search.
 
     Args:
-        latent_dim, action_dim, hidden_dim, depth: see :class:`~torchrl_ficreg.modules.goal_network.GoalNetwork`.
+        latent_dim, action_dim, hidden_dim, depth: see :class:`~torchrl_ficreg.modules.goal_policy.GoalNetwork`.
         in_keys, out_key: where the latent and the goal latent are read, told apart by name where they can be, and the action
             block is written.
 

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_ficreg.data.schema import LATENT, RECOVERED_ACTION
+from torchrl_ficreg.keys import LATENT, RECOVERED_ACTION
 from torchrl_ficreg.modules.feed import NEXT_LATENT, sort_keys
 from torchrl_ficreg.modules.transformer import Block
 

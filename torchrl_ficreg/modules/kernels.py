@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from torchrl_ficreg.modules.precision import has_amx
+from torchrl_ficreg._device import has_amx
 
 MANY = 1024  # rows from which the sum over them, for the gradient of a bias, is worth a matrix product
 CACHED = 4 * 2**20  # bytes of attention weights worked on at once: more do not stay in the cache

@@ -7,10 +7,9 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_ficreg.data.schema import LATENT, PIXELS
-from torchrl_ficreg.modules.batch_norm import GlobalBatchNorm1d
-from torchrl_ficreg.modules.pixels import channels_last, PixelNormalizer, restore_lead
-from torchrl_ficreg.modules.precision import convolution_region, without_autocast
+from torchrl_ficreg._device import convolution_region, without_autocast
+from torchrl_ficreg.keys import LATENT, PIXELS
+from torchrl_ficreg.modules.layers import channels_last, GlobalBatchNorm1d, PixelNormalizer, restore_lead
 
 _STRIDE = 4  # pixels between neighbouring places of a map
 
@@ -102,7 +101,7 @@ class KeypointEncoder(TensorDictModule):
         **network: see :class:`KeypointNetwork`.
 
     Raises:
-        TypeError, ValueError: see :class:`~torchrl_ficreg.modules.pixels.PixelNormalizer`.
+        TypeError, ValueError: see :class:`~torchrl_ficreg.modules.layers.PixelNormalizer`.
 
     Examples:
         >>> from tensordict import TensorDict

@@ -7,11 +7,10 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_ficreg.data.schema import ACTION, LATENT, PREDICTED_LATENT
+from torchrl_ficreg.keys import ACTION, LATENT, PREDICTED_LATENT
 from torchrl_ficreg.modules.feed import sort_keys
-from torchrl_ficreg.modules.projector import Projector
-from torchrl_ficreg.modules.recompute import run_block
-from torchrl_ficreg.modules.transformer import AdaptiveBlock, Cache
+from torchrl_ficreg.modules.layers import Projector
+from torchrl_ficreg.modules.transformer import AdaptiveBlock, Cache, run_block
 
 
 class ActionEmbedding(nn.Module):
@@ -82,7 +81,7 @@ class CausalTransformer(nn.Module):
         position_std: standard deviation of the position embedding at the start of training.
 
     Attributes:
-        checkpointing: see :func:`~torchrl_ficreg.modules.recompute.checkpoint_activations`.
+        checkpointing: see :func:`~torchrl_ficreg.modules.transformer.checkpoint_activations`.
     """
 
     checkpointing = False

@@ -9,12 +9,10 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_ficreg.data.schema import LATENT, PIXELS
+from torchrl_ficreg.keys import LATENT, PIXELS
 from torchrl_ficreg.modules.kernels import Linear
-from torchrl_ficreg.modules.pixels import PixelNormalizer, restore_lead
-from torchrl_ficreg.modules.projector import Projector
-from torchrl_ficreg.modules.recompute import run_block
-from torchrl_ficreg.modules.transformer import Block
+from torchrl_ficreg.modules.layers import PixelNormalizer, Projector, restore_lead
+from torchrl_ficreg.modules.transformer import Block, run_block
 
 Init = Literal["torch", "published"]
 
@@ -32,7 +30,7 @@ class VisionTransformer(nn.Module):
             +-2, and sets biases to 0, as the encoder of the published code (transformers' ``ViTModel``) does.
 
     Attributes:
-        checkpointing: see :func:`~torchrl_ficreg.modules.recompute.checkpoint_activations`.
+        checkpointing: see :func:`~torchrl_ficreg.modules.transformer.checkpoint_activations`.
 
     Raises:
         ValueError: an unknown ``init``, or an ``image_size`` that is no multiple of ``patch_size``.
@@ -103,7 +101,7 @@ class ViTEncoder(TensorDictModule):
         **network: see :class:`VisionTransformer`.
 
     Raises:
-        TypeError, ValueError: see :class:`~torchrl_ficreg.modules.pixels.PixelNormalizer`.
+        TypeError, ValueError: see :class:`~torchrl_ficreg.modules.layers.PixelNormalizer`.
 
     Examples:
         >>> import torch

@@ -6,10 +6,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_ficreg.data.schema import ACTION, LATENT, PIXELS, PREDICTED_LATENT
-from torchrl_ficreg.data.statistics import ActionStatistics
+from torchrl_ficreg.data.action_statistics import ActionStatistics
+from torchrl_ficreg.keys import ACTION, LATENT, PIXELS, PREDICTED_LATENT
 from torchrl_ficreg.modules.feed import arrange, choose_output, feed, Names, read_output, require_module
-from torchrl_ficreg.modules.pixels import check_finite
+from torchrl_ficreg.modules.layers import check_finite
 from torchrl_ficreg.modules.predictor import CausalPredictor
 
 

@@ -1,13 +1,12 @@
 """Losses: who receives gradient, and from what."""
 
+from torchrl_ficreg.objectives.diagnostics import gradient_flow, latent_health, LatentHealth
 from torchrl_ficreg.objectives.ficreg import FICRegLoss
-from torchrl_ficreg.objectives.flow import gradient_flow
-from torchrl_ficreg.objectives.health import latent_health, LatentHealth
 from torchrl_ficreg.objectives.joint_inverse import JointInverseLoss
 from torchrl_ficreg.objectives.lewm import LeWMLoss
 from torchrl_ficreg.objectives.pldm import PLDMLoss
 from torchrl_ficreg.objectives.sigreg import SIGReg
-from torchrl_ficreg.objectives.vicreg import CovariancePenalty, TemporalStraightness, VarianceHinge
+from torchrl_ficreg.objectives.terms import CovariancePenalty, TemporalStraightness, VarianceHinge
 
 __all__ = [
     "CovariancePenalty",

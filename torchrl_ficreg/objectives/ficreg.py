@@ -8,11 +8,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
+from torchrl_ficreg.distributed import gather_clips
 from torchrl_ficreg.modules.inverse import LOG_VAR
-from torchrl_ficreg.objectives.base import Reduction, takes_clip, with_own_buffers
-from torchrl_ficreg.objectives.clip import Clip
-from torchrl_ficreg.objectives.gather import gather_clips
-from torchrl_ficreg.objectives.judge import inverse_error, judge_report, mean_where, Recovered, trust
+from torchrl_ficreg.objectives.base import Clip, Reduction, takes_clip, with_own_buffers
+from torchrl_ficreg.objectives.inverse_terms import inverse_error, judge_report, mean_where, Recovered, trust
 from torchrl_ficreg.objectives.lewm import LeWMLoss
 from torchrl_ficreg.objectives.sigreg import SIGReg
 from torchrl_ficreg.objectives.terms import gaussian_nll, squared_error
@@ -58,13 +57,13 @@ class FICRegLoss(LeWMLoss):
         context: ``"detached"`` or ``"live"``, see above.
         consistency: ``"mse"``; ``"nll"``, the likelihood under a Gaussian judge; or ``"trusted"``, the squared error
             weighted, for every sample and action dimension, by how well the judge does on the real transition of the
-            same clip (:func:`~torchrl_ficreg.objectives.judge.trust`): where it cannot tell, it does not push.
+            same clip (:func:`~torchrl_ficreg.objectives.inverse_terms.trust`): where it cannot tell, it does not push.
         consistency_target: ``"action"``, the one taken, or ``"judge"``, what the judge recovers from the *real*
             transition: predictions are then not rewarded for carrying more of the action than reality does, as at
             walls and contacts.
         consistency_steps: k; also judges imagined transitions 2 to k steps deep, each fed by predictions.
         diagnostics: also write, detached and no part of the objective, ``judge_r2_real``, ``judge_r2_imagined`` and
-            ``judge_r2_shuffled`` [F * A] (:func:`~torchrl_ficreg.objectives.judge.judge_report`) and ``judge_trust``
+            ``judge_r2_shuffled`` [F * A] (:func:`~torchrl_ficreg.objectives.inverse_terms.judge_report`) and ``judge_trust``
             [F * A], the mean weight.
 
     Raises:

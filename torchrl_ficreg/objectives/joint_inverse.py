@@ -6,7 +6,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
 from torchrl_ficreg.objectives.base import Reduction, takes_clip
-from torchrl_ficreg.objectives.judge import inverse_error
+from torchrl_ficreg.objectives.inverse_terms import inverse_error
 from torchrl_ficreg.objectives.lewm import LeWMLoss
 from torchrl_ficreg.objectives.sigreg import SIGReg
 

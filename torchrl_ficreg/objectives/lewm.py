@@ -6,8 +6,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
-from torchrl_ficreg.objectives.base import LatentLoss, Reduction, takes_clip
-from torchrl_ficreg.objectives.clip import Clip
+from torchrl_ficreg.objectives.base import Clip, LatentLoss, Reduction, takes_clip
 from torchrl_ficreg.objectives.sigreg import SIGReg
 from torchrl_ficreg.objectives.terms import squared_error
 

@@ -6,9 +6,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
+from torchrl_ficreg.distributed import gather_clips
 from torchrl_ficreg.objectives.base import LatentLoss, Reduction, takes_clip
-from torchrl_ficreg.objectives.gather import gather_clips
-from torchrl_ficreg.objectives.judge import inverse_error
+from torchrl_ficreg.objectives.inverse_terms import inverse_error
 from torchrl_ficreg.objectives.terms import hinge_std, off_diagonal_covariance, squared_error
 
 

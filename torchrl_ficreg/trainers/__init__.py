@@ -1,17 +1,21 @@
 """Offline training on TorchRL's trainer."""
 
-from torchrl_ficreg.trainers.checkpoint import checkpoint_components, find_checkpoint, load_world_model, ModelCard
-from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
-from torchrl_ficreg.trainers.meter import Meter
-from torchrl_ficreg.trainers.offline import OfflineTrainer
+from torchrl_ficreg.trainers.checkpoint import checkpoint_components, find_checkpoint, load_world_model
+from torchrl_ficreg.trainers.hooks import (
+    CoefficientSchedule,
+    LatentAlarm,
+    Meter,
+    MetricsTable,
+    Progress,
+    SuccessRate,
+    Validation,
+)
+from torchrl_ficreg.trainers.loggers import TolerantLogger
+from torchrl_ficreg.trainers.offline import OfflineTrainer, WarmupCosine
 from torchrl_ficreg.trainers.refinement import LatentsAsFrames, NoRegularizer, on_frozen_latents, Refinement
-from torchrl_ficreg.trainers.schedule import WarmupCosine
 from torchrl_ficreg.trainers.signals import exit_on_signal, Preempted, PREEMPTED, stop_on_signal
 from torchrl_ficreg.trainers.stepper import OfflineStepper
 from torchrl_ficreg.trainers.stream import ReadError
-from torchrl_ficreg.trainers.success import SuccessRate
-from torchrl_ficreg.trainers.tolerant import TolerantLogger
-from torchrl_ficreg.trainers.watch import CoefficientSchedule, LatentAlarm
 
 __all__ = [
     "CoefficientSchedule",
@@ -19,7 +23,6 @@ __all__ = [
     "LatentsAsFrames",
     "Meter",
     "MetricsTable",
-    "ModelCard",
     "NoRegularizer",
     "OfflineStepper",
     "OfflineTrainer",

@@ -12,22 +12,83 @@ import tempfile
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import torch
 from torchrl import torchrl_logger
-from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, GlobalRNGState
 
+from torchrl_ficreg._safe_files import check_kinds, check_numbers, check_shapes, check_sizes, state_of
 from torchrl_ficreg._utils import MOST_JSON_BYTES, read_json, require_regular_file
+from torchrl_ficreg.modules.config import make_world_model, ModelConfig
 from torchrl_ficreg.modules.inverse import InverseDynamicsModel
-from torchrl_ficreg.modules.presets import make_world_model, ModelConfig
-from torchrl_ficreg.modules.pretrained.folder import load_pretrained, WEIGHTS_FILE
-from torchrl_ficreg.modules.safe_files import check_kinds, check_numbers, check_shapes, check_sizes, state_of
 from torchrl_ficreg.modules.world_model import LatentWorldModel
+from torchrl_ficreg.pretrained.folder import load_pretrained, ModelCard, WEIGHTS_FILE
+
+
+_CUDA, _ALL_CUDA = "cuda", "torch_cuda"  # ours: one device; TorchRL's: a list of all, found in older checkpoints
+
+
+class RandomState(GlobalRNGState):
+    """Random states of Python, NumPy, PyTorch's CPU and one device; TorchRL's component keeps those of all devices.
+
+    A run may so be continued with fewer devices, or without any: states of absent ones are left out with one warning.
+
+    Args:
+        device: the one that is trained on. Default: the current one, where CUDA is in use.
+
+    Examples:
+        >>> state = RandomState()
+        >>> before = state.state_dict()
+        >>> first = torch.rand(1)
+        >>> state.load_state_dict(before)
+        >>> torch.equal(torch.rand(1), first)
+        True
+    """
+
+    def __init__(self, device: torch.device | str | None = None) -> None:
+        self._device = None if device is None else torch.device(device)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The states as they are now."""
+        state = super().state_dict()
+        if _ALL_CUDA in state:
+            every = state.pop(_ALL_CUDA)
+            if self._device is None or self._device.type == "cuda":
+                state[_CUDA] = every[self._index()]
+        return state
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Takes over the states of what is there. One that a checkpoint does not have stays as it is."""
+        states = dict(state_dict)
+        every, one = states.pop(_ALL_CUDA, ()), states.pop(_CUDA, None)
+        devices = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        absent = [f"cuda:{number}" for number in range(devices, len(every))]
+        if one is not None and not devices:
+            absent.append("cuda")
+        for name in ("xpu", "mps"):
+            if f"torch_{name}" in states and not getattr(torch, name).is_available():
+                del states[f"torch_{name}"]
+                absent.append(name)
+        super().load_state_dict(states)
+        for number, state in enumerate(every[:devices]):
+            torch.cuda.set_rng_state(state.cpu(), number)
+        if one is not None and devices:
+            torch.cuda.set_rng_state(one.cpu(), self._index())
+        if absent:
+            torchrl_logger.warning(
+                f"random states of {', '.join(absent)} are left out, no such device is here: the run goes on, with "
+                "other random numbers than where it began."
+            )
+
+    def _index(self) -> int:
+        index = None if self._device is None else self._device.index
+        return torch.cuda.current_device() if index is None else index
+
 
 CHECKPOINTS = "checkpoints"
 SUCCESS = "success_rate"  # in the manifest of a checkpoint; negative where it was not measured
@@ -40,47 +101,6 @@ _UNPACKED_SECONDS = 24 * 3600.0  # no loader takes as long
 _MOST_UNPACKED = 16  # times the size of an archive: what trained weights and moments never shrink by
 # What reading a damaged or foreign checkpoint raises.
 DAMAGES = (CheckpointError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError)
-
-
-@dataclass(frozen=True)
-class ModelCard:
-    """What one must know about a model to use it without its dataset, as plain JSON values.
-
-    Attributes:
-        model: fields of :class:`ModelConfig`.
-        env: name of the environment it was trained on.
-        env_kwargs: how that environment was made.
-        action_low, action_high: bounds of a raw action [A], environment units.
-        config: the whole resolved configuration of the run that made it.
-
-    Raises:
-        ValueError: a field of another type, or bounds that are no two lists of one length.
-    """
-
-    model: dict[str, Any]
-    env: str
-    env_kwargs: dict[str, Any]
-    action_low: list[float]
-    action_high: list[float]
-    config: dict[str, Any]
-
-    def __post_init__(self) -> None:
-        kinds = {"model": dict, "env": str, "env_kwargs": dict, "config": dict}
-        for name, kind in kinds.items():
-            if not isinstance(getattr(self, name), kind):
-                raise ValueError(f"{name} of a model's card must be a {kind.__name__}, got {str(getattr(self, name))[:40]!r}.")
-        bounds = self.action_low, self.action_high
-        lists = all(isinstance(bound, (list, tuple)) and all(isinstance(n, (int, float)) for n in bound) for bound in bounds)
-        if not lists or not 0 < len(bounds[0]) == len(bounds[1]) or not all(a <= b for a, b in zip(*bounds)):
-            raise ValueError(
-                f"action_low={str(bounds[0])[:40]} and action_high={str(bounds[1])[:40]} of a model's card must be two lists "
-                "of as many numbers, low <= high."
-            )
-
-    @property
-    def action_dim(self) -> int:
-        """A, raw action dimension."""
-        return len(self.action_low)
 
 
 def checkpoint_components(
@@ -446,7 +466,7 @@ def load_world_model(path: Path | str) -> tuple[LatentWorldModel, InverseDynamic
 
     Args:
         path: a run directory, one checkpoint, or a folder written by
-            :func:`~torchrl_ficreg.modules.pretrained.save_pretrained` with a card.
+            :func:`~torchrl_ficreg.pretrained.save_pretrained` with a card.
 
     Returns:
         the world model and its inverse dynamics model, in eval mode on the CPU, and the card. The inverse model is None

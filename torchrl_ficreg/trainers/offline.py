@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import shutil
+import time
 from collections import defaultdict, deque
 from functools import partial
 from pathlib import Path
@@ -17,28 +19,75 @@ from torchrl.record.loggers import Logger
 from torchrl.trainers import Trainer
 from torchrl.trainers.trainers import LRSchedulerHook
 
+from torchrl_ficreg._device import keep_freed_memory, Precision
 from torchrl_ficreg.data import OfflineTrajectories
-from torchrl_ficreg.modules.memory import keep_freed_memory
-from torchrl_ficreg.modules.precision import Precision
+from torchrl_ficreg.distributed import from_main, is_main, rank, wait_for_all, world_size
 from torchrl_ficreg.trainers.checkpoint import (
     check_members,
     check_room,
     CHECKPOINTS,
     DAMAGES,
     latest_whole,
+    RandomState,
     set_odd_aside,
     sweep_unpacked,
 )
-from torchrl_ficreg.trainers.clock import Clock
-from torchrl_ficreg.trainers.distributed import from_main, is_main, rank, wait_for_all, world_size
-from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Validation
-from torchrl_ficreg.trainers.meter import Meter
-from torchrl_ficreg.trainers.parallel import parallelise, Strategy
-from torchrl_ficreg.trainers.rng import RandomState
-from torchrl_ficreg.trainers.schedule import WarmupCosine
-from torchrl_ficreg.trainers.stepper import OfflineStepper
+from torchrl_ficreg.trainers.hooks import Meter, MetricsTable, Progress, Validation
+from torchrl_ficreg.trainers.loggers import TolerantLogger
+from torchrl_ficreg.trainers.stepper import OfflineStepper, parallelise, Strategy
 from torchrl_ficreg.trainers.stream import ReadError, ReplayStream
-from torchrl_ficreg.trainers.tolerant import TolerantLogger
+
+
+class Clock:
+    """Wall time spent in training, over all lives of a run."""
+
+    def __init__(self) -> None:
+        self._before, self._began = 0.0, None
+
+    @property
+    def seconds(self) -> float:
+        """Seconds so far."""
+        return self._before + (time.perf_counter() - self._began if self._began is not None else 0.0)
+
+    def start(self) -> None:
+        """Begins to count."""
+        self._began = time.perf_counter()
+
+    def stop(self) -> None:
+        """Ceases to count."""
+        self._before, self._began = self.seconds, None
+
+    def state_dict(self) -> dict[str, float]:
+        """The seconds so far."""
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Continues from there."""
+        self._before = float(state_dict["seconds"])
+
+
+class WarmupCosine:
+    """Factor of the learning rate: linear from 0 over the warm-up, then a cosine to 0 at the last step.
+
+    Args:
+        steps: of the whole schedule, which a run may leave before its end.
+        warmup: share of them in which the factor rises.
+
+    Examples:
+        >>> factor = WarmupCosine(steps=100, warmup=0.1)
+        >>> factor(0), factor(9), round(factor(100), 6)
+        (0.1, 1.0, 0.0)
+    """
+
+    def __init__(self, steps: int, warmup: float) -> None:
+        self.steps, self.rise = steps, max(1, round(warmup * steps))
+
+    def __call__(self, step: int) -> float:
+        """Factor of the update after ``step`` updates."""
+        if step < self.rise:
+            return (step + 1) / self.rise
+        return 0.5 * (1 + math.cos(math.pi * (step - self.rise) / max(1, self.steps - self.rise)))
+
 
 METRICS = "metrics.csv"
 _KEPT = 100  # latest numbers of each kind in memory, for hooks such as TorchRL's EarlyStopping; all are in metrics.csv
@@ -81,7 +130,7 @@ class OfflineTrainer(Trainer):
         lr, weight_decay: of AdamW.
         warmup: share of the schedule in which the learning rate rises from zero.
         clip_norm: largest gradient norm.
-        precision: see :func:`~torchrl_ficreg.modules.precision.autocast`.
+        precision: see :func:`~torchrl_ficreg._device.autocast`.
         run_dir: folder for metrics and checkpoints; None writes nothing.
         components: more things to put into a checkpoint, by name: anything with a ``state_dict``, or JSON values.
         validation_buffer: clips of held-out episodes, evaluated after every epoch.
@@ -89,7 +138,7 @@ class OfflineTrainer(Trainer):
         log_interval: steps between rows of ``metrics.csv``.
         logger: a TorchRL logger that receives the same numbers.
         progress_bar: show one.
-        strategy: of several processes, ``"ddp"`` or ``"fsdp"``; see :mod:`~torchrl_ficreg.trainers.parallel`.
+        strategy: of several processes, ``"ddp"`` or ``"fsdp"``; see :mod:`~torchrl_ficreg.trainers.stepper`.
         accumulate: parts of a batch that are learned from one after another; see :class:`OfflineStepper`.
         compile: the loss, by ``torch.compile``.
 

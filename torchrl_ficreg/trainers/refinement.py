@@ -10,11 +10,11 @@ from torch import nn
 from torchrl.objectives.common import LossModule
 from tqdm import trange
 
+from torchrl_ficreg._device import autocast, Precision
 from torchrl_ficreg.data.latents import LatentClips
-from torchrl_ficreg.data.schema import ACTION, LATENT, PIXELS
-from torchrl_ficreg.modules.precision import autocast, Precision
+from torchrl_ficreg.keys import ACTION, LATENT, PIXELS
 from torchrl_ficreg.modules.world_model import LatentWorldModel
-from torchrl_ficreg.trainers.schedule import WarmupCosine
+from torchrl_ficreg.trainers.offline import WarmupCosine
 
 
 class LatentsAsFrames(TensorDictModule):

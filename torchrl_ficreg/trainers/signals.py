@@ -9,7 +9,7 @@ from types import FrameType
 
 from torchrl.trainers import Trainer
 
-from torchrl_ficreg.trainers.distributed import any_process, together
+from torchrl_ficreg.distributed import any_process, together
 
 # Told apart from success, from an error (1) and from a death by the signal (143): start the same command again. It is
 # the number that HTCondor takes for "wrote a checkpoint", and that a SLURM script can ask for before

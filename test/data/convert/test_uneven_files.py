@@ -13,7 +13,7 @@ import pytest
 from foreign_files import write_ogbench
 
 from torchrl_ficreg.data.convert import from_arrays, measure_alignment, open_source
-from torchrl_ficreg.data.convert.arrow import to_array
+from torchrl_ficreg.data.convert._arrow import to_array
 from torchrl_ficreg.data.convert.table import Column, require
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from torchrl_ficreg.data.convert.alignment import Alignment, measure_alignment
 from torchrl_ficreg.data.convert.arrays import from_arrays
+from torchrl_ficreg.data.convert.conversion import convert, verify_alignment
 from torchrl_ficreg.data.convert.formats import detect_format, FORMATS, open_source
-from torchrl_ficreg.data.convert.source import EpisodeSource
-from torchrl_ficreg.data.convert.stream import convert, verify_alignment
-from torchrl_ficreg.data.convert.tasks import TASKS
+from torchrl_ficreg.data.convert.source import EpisodeSource, TASKS
 
 __all__ = [
     "Alignment",

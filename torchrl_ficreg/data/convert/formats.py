@@ -8,7 +8,7 @@ from pathlib import Path
 from torchrl_ficreg.data.convert.hdf5 import HDF5Table
 from torchrl_ficreg.data.convert.lance import LanceTable
 from torchrl_ficreg.data.convert.lerobot import INFO, LeRobotTable
-from torchrl_ficreg.data.convert.npz import NpzTable
+from torchrl_ficreg.data.convert.ogbench import NpzTable
 from torchrl_ficreg.data.convert.source import EpisodeSource
 from torchrl_ficreg.data.convert.table import reading, some, Table
 from torchrl_ficreg.data.layout import META_FILE

@@ -10,7 +10,7 @@ import torch
 from torch.nn.functional import interpolate
 
 from torchrl_ficreg.data.convert.table import brief, require
-from torchrl_ficreg.data.threads import default_threads, run_split
+from torchrl_ficreg.data.frames import default_threads, run_split
 
 
 # Pillow also knows formats that start other programs, such as EPS.

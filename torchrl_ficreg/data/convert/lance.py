@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from torchrl_ficreg.data.convert.arrow import describe, first_cells, split, to_array
+from torchrl_ficreg.data.convert._arrow import describe, first_cells, split, to_array
 from torchrl_ficreg.data.convert.table import bounds_from_ids, check_inside, check_steps, require, some, Table
 
 EPISODE_IDS, STEPS = ("episode_idx", "ep_idx"), "step_idx"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_ficreg._utils import MOST_JSON_BYTES, read_bytes
-from torchrl_ficreg.data.convert.arrow import describe, first_cells, split, to_array
+from torchrl_ficreg.data.convert._arrow import describe, first_cells, split, to_array
 from torchrl_ficreg.data.convert.table import (
     Bounds,
     bounds_from_ids,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from math import prod
 from typing import Any
 
@@ -11,8 +12,36 @@ import numpy as np
 
 from torchrl_ficreg.data.convert.images import is_channels_last, MOST_PIXELS, resize, to_frames
 from torchrl_ficreg.data.convert.table import brief, is_foreign, Kind, some, Table
-from torchrl_ficreg.data.convert.tasks import OTHER_ACTIONS, OTHER_PIXELS, OTHER_STATES, TASKS
-from torchrl_ficreg.data.schema import ACTION, PIXELS, STATE
+from torchrl_ficreg.keys import ACTION, PIXELS, STATE
+
+
+@dataclass(frozen=True)
+class TaskColumns:
+    """What a file has to hold for one environment.
+
+    Attributes:
+        states: candidates in order of preference; each is a list of columns that are joined.
+        state_dim: S.
+        action_dim: A. Every component of these environments' actions is bounded by -1 and 1.
+    """
+
+    states: tuple[tuple[str, ...], ...]
+    state_dim: int
+    action_dim: int
+
+
+TASKS: dict[str, TaskColumns] = {
+    "two_room": TaskColumns((("state",), ("pos_agent",), ("proprio",)), state_dim=2, action_dim=2),
+    "push_t": TaskColumns((("state",),), state_dim=7, action_dim=2),
+    "reacher": TaskColumns((("qpos", "qvel"),), state_dim=4, action_dim=2),
+    "cube": TaskColumns((("qpos", "qvel"),), state_dim=41, action_dim=5),
+}
+
+# For any other data. The simulator's own coordinates come first: they are what restores it.
+OTHER_STATES = (("state",), ("qpos", "qvel"), ("observation.state",), ("observation",), ("observations",))
+OTHER_PIXELS = ("pixels", "observations", "observation.image", "image")
+OTHER_ACTIONS = ("action", "actions")
+
 
 # Frames read and scaled at once. Long episodes at 224 pixels would otherwise need their size several times over.
 _BLOCK_ROWS = 200

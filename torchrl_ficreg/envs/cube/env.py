@@ -9,15 +9,9 @@ from gymnasium import spaces
 
 from torchrl_ficreg.envs.base import GoalEnv
 from torchrl_ficreg.envs.cube import tasks
-from torchrl_ficreg.envs.cube.arm import CubeArm
-from torchrl_ficreg.envs.cube.poses import (
-    CUBE_POSITION,
-    CUBE_ROTATION,
-    pose_reached,
-    position_reached,
-    STATE_SIZE,
-)
-from torchrl_ficreg.envs.cube.rendering import check_detail, Detail, render
+from torchrl_ficreg.envs.cube.physics import CUBE_POSITION, CUBE_ROTATION, CubeArm, STATE_SIZE
+from torchrl_ficreg.envs.cube.render import check_detail, Detail, render
+from torchrl_ficreg.envs.cube.tasks import pose_reached, position_reached
 
 SuccessRule = Literal["position", "pose"]
 
@@ -29,16 +23,16 @@ _FARTHEST = 2.0  # m from the foot of the arm, beyond anything it could throw a 
 class CubeEnv(GoalEnv):
     """OGBench's single cube as a goal-conditioned Gymnasium environment: UR5e arm, two-finger gripper, one red cube.
 
-    State: MuJoCo's 21 positions and 20 velocities, laid out in :mod:`torchrl_ficreg.envs.cube.poses`. Action: [5] in
+    State: MuJoCo's 21 positions and 20 velocities, laid out in :mod:`torchrl_ficreg.envs.cube.tasks`. Action: [5] in
     [-1, 1], shifts of the gripper by 0.05 m, a turn by 0.3 rad and a change of its opening by 1 per unit, see
-    :class:`~torchrl_ficreg.envs.cube.arm.CubeArm`; larger ones are not clipped, as published. One step takes 0.05 s.
+    :class:`~torchrl_ficreg.envs.cube.physics.CubeArm`; larger ones are not clipped, as published. One step takes 0.05 s.
     Resets put the cube and its target anywhere in [0.3, 0.55] x [-0.3, 0.3] m, both turned at random, and the open
     gripper 0.275 m above the middle of the table; the goal state shows the cube at rest at the target.
 
     Args:
         success_on: ``"position"``, the published rule: the cube's centre is at most 0.04 m from the goal's, however
             it is turned. ``"pose"``: at most 0.03 m and at most 15 degrees, the symmetries of the cube aside.
-        detail: of the pictures, see :func:`torchrl_ficreg.envs.cube.rendering.render`.
+        detail: of the pictures, see :func:`torchrl_ficreg.envs.cube.render.render`.
         **kwargs: see :class:`torchrl_ficreg.envs.base.GoalEnv`.
 
     Attributes:

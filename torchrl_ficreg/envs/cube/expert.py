@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_ficreg.envs.cube.arm import CubeArm, TIME_STEP
+from torchrl_ficreg.envs.cube.physics import CubeArm, TIME_STEP
 
 
 class CubeExpert:

@@ -6,7 +6,7 @@ Pictures and draws need no simulator; ``PushTEnv`` and ``PushTWorld`` live in mo
 
 from __future__ import annotations
 
-from torchrl_ficreg.envs.push_t.rendering import render
+from torchrl_ficreg.envs.push_t.render import render
 from torchrl_ficreg.envs.push_t.tasks import sample_state
 
 __all__ = ["render", "sample_state"]

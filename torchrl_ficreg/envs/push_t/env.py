@@ -8,13 +8,12 @@ from typing import Any, get_args
 import numpy as np
 from gymnasium import spaces
 
-from torchrl_ficreg.data.schema import STATE
 from torchrl_ficreg.envs.base import GOAL_STATE, GoalEnv
 from torchrl_ficreg.envs.push_t import tasks
-from torchrl_ficreg.envs.push_t.physics import PushTWorld
-from torchrl_ficreg.envs.push_t.rendering import render
-from torchrl_ficreg.envs.push_t.shapes import STATE_SIZE
+from torchrl_ficreg.envs.push_t.physics import PushTWorld, STATE_SIZE
+from torchrl_ficreg.envs.push_t.render import render
 from torchrl_ficreg.envs.push_t.tasks import SuccessRule
+from torchrl_ficreg.keys import STATE
 
 # The disc passes walls: 200 steps of full speed, 40.7 px each, from the inside of the window stay within this.
 _FARTHEST = 10_000.0  # px, and px/s

@@ -8,13 +8,86 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchrl_ficreg.envs.push_t.geometry import CENTER, difference, overshoot, Paths, rotation, to_block, to_window
-from torchrl_ficreg.envs.push_t.physics import SUBSTEPS, TIME_STEP
-from torchrl_ficreg.envs.push_t.pushes import NORMALS, POINTS, pushed, STAND_OFF, STANDS
-from torchrl_ficreg.envs.push_t.shapes import AGENT_RADIUS, WINDOW
-
+from torchrl_ficreg.envs.push_t.geometry import (
+    CENTER,
+    difference,
+    leave,
+    overshoot,
+    Paths,
+    rotation,
+    to_block,
+    to_window,
+)
+from torchrl_ficreg.envs.push_t.physics import AGENT_RADIUS, BLOCK_MASS, BLOCK_MOMENT, SUBSTEPS, TIME_STEP, WINDOW
 if TYPE_CHECKING:
     from torchrl_ficreg.envs.push_t.env import PushTEnv
+
+
+RATIO = BLOCK_MOMENT / BLOCK_MASS  # px^2
+STAND_OFF = 14.0  # px between the disc's edge and the face where an approach ends
+
+# first and last x (of horizontal faces) or y (of vertical ones), the other coordinate, number of contacts, inward normal
+_FACES = (
+    ((-52, 52), 0, 13, (0, 1)),  # top of the bar
+    ((6, 24), 60, 3, (-1, 0)),  # ends of the bar
+    ((6, 24), -60, 3, (1, 0)),
+    ((31, 52), 30, 4, (0, -1)),  # underside of the bar, from the concave corners outwards
+    ((-52, -31), 30, 4, (0, -1)),
+    ((46, 112), 15, 9, (-1, 0)),  # sides of the stem
+    ((46, 112), -15, 9, (1, 0)),
+    ((-8, 8), 120, 3, (0, -1)),  # end of the stem
+)
+
+
+def _contacts() -> tuple[np.ndarray, np.ndarray]:
+    points, normals = [], []
+    for (first, last), other, number, normal in _FACES:
+        for along in np.linspace(first, last, number):
+            points.append((along, other) if normal[0] == 0 else (other, along))
+            normals.append(normal)
+    return np.array(points, float), np.array(normals, float)
+
+
+POINTS, NORMALS = _contacts()  # [N, 2] each, in the block's frame; normals point into the block
+LEVERS = (POINTS[:, 0] - CENTER[0]) * NORMALS[:, 1] - (POINTS[:, 1] - CENTER[1]) * NORMALS[:, 0]  # [N], px
+STANDS = np.stack([leave(place) for place in POINTS - (AGENT_RADIUS + STAND_OFF) * NORMALS])  # [N, 2]
+
+
+def pushed(pose: np.ndarray, contact: int | np.ndarray, depth: float | np.ndarray) -> np.ndarray:
+    """The pose after a push.
+
+    Args:
+        pose: [3], of the block.
+        contact: index of the contact, or an array of them.
+        depth: px that the disc moves along the normal; broadcast against ``contact``.
+
+    Returns:
+        [..., 3]; the angle is not wrapped.
+
+    Examples:
+        Through the centre of gravity the block follows the disc; at a lever of 52 px it turns:
+
+        >>> pushed(np.array([200.0, 200.0, 0.0]), 6, 10.0).tolist()
+        [200.0, 210.0, 0.0]
+        >>> pushed(np.array([200.0, 200.0, 0.0]), 12, 10.0).round(2).tolist()
+        [203.86, 205.44, 0.09]
+    """
+    levers, normals = LEVERS[contact], NORMALS[contact]
+    share = depth / (1 + levers**2 / RATIO)
+    turn = share * levers / RATIO
+    # Chord of the arc: half the turn, and shorter than the arc.
+    chord = (share * np.sinc(turn / (2 * np.pi)))[..., None] * _turned(normals, pose[2] + turn / 2)
+    angle = pose[2] + turn
+    center = _turned(CENTER, pose[2]) + pose[:2] + chord
+    origin = center - _turned(CENTER, angle)
+    return np.concatenate([origin, np.asarray(angle)[..., None]], axis=-1)
+
+
+def _turned(vectors: np.ndarray, angle: float | np.ndarray) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
 
 REACH = 40.69  # px per step at which the disc settles under a constant action of 1
 STEP_TIME = TIME_STEP * SUBSTEPS  # s
@@ -32,7 +105,7 @@ class PushTExpert:
     """Pushes the T about: target poses, contact faces, ways around the T, and free motion in between.
 
     A target pose is at most 130 px and 110 degrees away, in the interior of the window. For each push the pusher tries
-    all contacts of :mod:`~torchrl_ficreg.envs.push_t.pushes` and many depths in the quasi-static model, and takes one
+    all contacts of :mod:`~torchrl_ficreg.envs.push_t.expert` and many depths in the quasi-static model, and takes one
     that brings the block closest for its time, the way around the T included. It approaches with a clearance of 20 px,
     pushes along the normal of the face while it follows the contact point, and corrects itself at each step. Some
     pushes are random ones, and some of the time it strolls or rests. Speeds are drawn anew for every movement.
@@ -95,7 +168,7 @@ class PushTExpert:
         """Chooses the next action.
 
         Args:
-            state: [7] float64, see :mod:`~torchrl_ficreg.envs.push_t.shapes`.
+            state: [7] float64, see :mod:`~torchrl_ficreg.envs.push_t.physics`.
             goal_state: [7] float64; looked at in the first step only.
 
         Returns:

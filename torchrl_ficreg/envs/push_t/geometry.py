@@ -1,14 +1,14 @@
 """The T as an obstacle: its outline, the poses it takes, and the shortest way around it.
 
 Two frames are used. Window: pixels as in the state. Block: the frame of the block, origin at the middle of the bar's
-top edge, as drawn in :mod:`~torchrl_ficreg.envs.push_t.shapes`. A pose [3] is (x, y, angle) of the block's origin.
+top edge, as drawn in :mod:`~torchrl_ficreg.envs.push_t.physics`. A pose [3] is (x, y, angle) of the block's origin.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from torchrl_ficreg.envs.push_t.shapes import AGENT_RADIUS, BAR, CENTER_OF_GRAVITY, STEM, T_CORNERS, WINDOW
+from torchrl_ficreg.envs.push_t.physics import AGENT_RADIUS, BAR, CENTER_OF_GRAVITY, STEM, T_CORNERS, WINDOW
 
 CENTER = np.array(CENTER_OF_GRAVITY)
 RECTANGLES = np.array([[np.min(part, 0), np.max(part, 0)] for part in (BAR, STEM)])  # [2, low and high, 2]

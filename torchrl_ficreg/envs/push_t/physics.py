@@ -1,31 +1,72 @@
 """The world of PushT: a driven disc and a T that rests unless it is touched, in pymunk.
 
-See :mod:`torchrl_ficreg.envs.push_t.shapes` for lengths and axes. Times are in seconds.
+See :mod:`torchrl_ficreg.envs.push_t.physics` for lengths and axes. Times are in seconds.
 """
 
 from __future__ import annotations
 
+import math
 import weakref
 from typing import Any
 
 import numpy as np
+
+
+WINDOW = 512
+AGENT_RADIUS = 15.0
+WALL_LOW, WALL_HIGH, WALL_RADIUS = 5.0, 506.0, 2.0
+BAR = ((-60.0, 30.0), (60.0, 30.0), (60.0, 0.0), (-60.0, 0.0))
+STEM = ((-15.0, 30.0), (-15.0, 120.0), (15.0, 120.0), (15.0, 30.0))
+CENTER_OF_GRAVITY = (0.0, 45.0)
+GOAL_POSE = (256.0, 256.0, math.pi / 4)  # of the green T, which is decoration: goals are drawn for each episode
+
+T_CORNERS = np.array(BAR + STEM)  # [8, 2], in the frame of the block
+STATE_SIZE = 7  # agent x, y; block x, y, angle in [0, 2 pi); agent velocity x, y in px/s
+
+
+def wrap(angle: float) -> float:
+    """Brings an angle to [0, 2 pi); one that is there already keeps its bits.
+
+    Examples:
+        >>> wrap(-1e-20), wrap(7.0) == 7.0 - 2 * math.pi
+        (0.0, True)
+    """
+    wrapped = angle % (2 * math.pi)
+    return wrapped if wrapped < 2 * math.pi else 0.0  # a tiny negative angle is rounded up to the whole turn
+
+
+def part_distances(x: np.ndarray, y: np.ndarray, *, stem_top: float = 30.0) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distances of points, in the frame of the block, from the edges of its bar and of its stem.
+
+    Args:
+        x: [...] float.
+        y: [...] float.
+        stem_top: where the stem begins; 0 lets it reach through the bar, so that the two have no seam.
+
+    Returns:
+        two arrays [...], negative inside.
+
+    Examples:
+        >>> part_distances(np.array([0.0, 0.0]), np.array([10.0, 130.0]))
+        (array([-10., 100.]), array([20., 10.]))
+    """
+    x = np.abs(x)
+    return _rectangle(x, y, 60.0, 0.0, 30.0), _rectangle(x, y, 15.0, stem_top, 120.0)
+
+
+def _rectangle(x: np.ndarray, y: np.ndarray, right: float, top: float, bottom: float) -> np.ndarray:
+    beside = x - right
+    beyond = np.abs(y - (top + bottom) / 2) - (bottom - top) / 2
+    nearest = np.maximum(beside, beyond)  # exact inside, and outside where one of the two is negative
+    corner = np.hypot(np.maximum(beside, 0), np.maximum(beyond, 0))
+    return np.where(nearest > 0, corner, nearest)
+
 
 try:
     import pymunk
 except ImportError as error:
     raise ImportError("PushT needs pymunk: pip install 'torchrl_ficreg[envs]'.") from error
 
-from torchrl_ficreg.envs.push_t.shapes import (
-    AGENT_RADIUS,
-    BAR,
-    CENTER_OF_GRAVITY,
-    STATE_SIZE,
-    STEM,
-    WALL_HIGH,
-    WALL_LOW,
-    WALL_RADIUS,
-    wrap,
-)
 
 BLOCK_MASS, BLOCK_MOMENT = 1.0, 3000.0
 
@@ -45,7 +86,7 @@ class PushTWorld:
     The disc is kinematic: it pushes the block, nothing pushes it, and walls do not stop it. Space has no friction and
     a damping that stills the block between two contacts.
 
-    State: [7] float64, see :mod:`torchrl_ficreg.envs.push_t.shapes`.
+    State: [7] float64, see :mod:`torchrl_ficreg.envs.push_t.physics`.
 
     Args:
         relative: an action shifts the target from where the disc is, by 100 px per unit; otherwise it is the target

@@ -7,14 +7,14 @@ from typing import Literal
 
 import numpy as np
 
-from torchrl_ficreg.envs.push_t.shapes import (
+from torchrl_ficreg.envs.push_t.physics import (
     AGENT_RADIUS,
+    part_distances,
     STATE_SIZE,
     T_CORNERS,
     WALL_HIGH,
     WALL_LOW,
     WALL_RADIUS,
-    part_distances,
 )
 
 SuccessRule = Literal["state", "block"]

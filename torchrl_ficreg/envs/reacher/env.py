@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
+from torchrl_ficreg.envs._gl import import_mujoco, MujocoHolder, OffscreenRenderer
 from torchrl_ficreg.envs.base import GoalEnv
-from torchrl_ficreg.envs.gl import MujocoHolder, OffscreenRenderer, import_mujoco
 from torchrl_ficreg.envs.reacher import physics
 
 _LARGEST = 1e4  # of all angles and velocities, far beyond what the motors can do

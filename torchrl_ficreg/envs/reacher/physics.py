@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchrl_ficreg.envs.gl import how_to_install, import_mujoco
+from torchrl_ficreg.envs._gl import how_to_install, import_mujoco
 
 if TYPE_CHECKING:
     import mujoco

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from torchrl_ficreg.envs.two_room.dynamics import TWO_ROOM, TwoRoomGeometry
 from torchrl_ficreg.envs.two_room.env import TwoRoomEnv
 from torchrl_ficreg.envs.two_room.expert import TwoRoomExpert
-from torchrl_ficreg.envs.two_room.rendering import render
+from torchrl_ficreg.envs.two_room.physics import TWO_ROOM, TwoRoomGeometry
+from torchrl_ficreg.envs.two_room.render import render
 from torchrl_ficreg.envs.two_room.tasks import sample_task
 
 __all__ = ["TWO_ROOM", "TwoRoomEnv", "TwoRoomExpert", "TwoRoomGeometry", "render", "sample_task"]

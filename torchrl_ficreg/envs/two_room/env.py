@@ -9,9 +9,9 @@ import torch
 from gymnasium import spaces
 
 from torchrl_ficreg.envs.base import GoalEnv
-from torchrl_ficreg.envs.two_room import dynamics, tasks
-from torchrl_ficreg.envs.two_room.dynamics import Collision, TWO_ROOM, TwoRoomGeometry
-from torchrl_ficreg.envs.two_room.rendering import render
+from torchrl_ficreg.envs.two_room import physics, tasks
+from torchrl_ficreg.envs.two_room.physics import Collision, TWO_ROOM, TwoRoomGeometry
+from torchrl_ficreg.envs.two_room.render import render
 
 
 class TwoRoomEnv(GoalEnv):
@@ -23,7 +23,7 @@ class TwoRoomEnv(GoalEnv):
 
     Args:
         collision: the wall rule, ``"swept"`` or, for the published one, ``"endpoint"``; see
-            :func:`torchrl_ficreg.envs.two_room.dynamics.step`.
+            :func:`torchrl_ficreg.envs.two_room.physics.step`.
         geometry: the scene.
         **kwargs: see :class:`torchrl_ficreg.envs.base.GoalEnv`.
 
@@ -65,7 +65,7 @@ class TwoRoomEnv(GoalEnv):
         self._position = torch.from_numpy(state.copy())
 
     def _step_physics(self, action: np.ndarray) -> None:
-        self._position = dynamics.step(
+        self._position = physics.step(
             self._position, torch.from_numpy(action), geometry=self.geometry, collision=self.collision
         )
 
@@ -73,11 +73,11 @@ class TwoRoomEnv(GoalEnv):
         return render(torch.from_numpy(state), size=self.image_size, geometry=self.geometry).numpy()
 
     def _is_success(self, state: np.ndarray, goal_state: np.ndarray) -> bool:
-        reached = dynamics.is_success(torch.from_numpy(state), torch.from_numpy(goal_state), geometry=self.geometry)
+        reached = physics.is_success(torch.from_numpy(state), torch.from_numpy(goal_state), geometry=self.geometry)
         return bool(reached)
 
     def _why_illegal(self, state: np.ndarray) -> str | None:
-        if dynamics.is_legal(torch.from_numpy(state), geometry=self.geometry):
+        if physics.is_legal(torch.from_numpy(state), geometry=self.geometry):
             return None
         low, high = self.geometry.border, self.geometry.canvas - self.geometry.border
         return f"it is inside the wall, or x or y leaves [{low}, {high}]"

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchrl_ficreg.envs.two_room.dynamics import TWO_ROOM
+from torchrl_ficreg.envs.two_room.physics import TWO_ROOM
 
 if TYPE_CHECKING:
     from torchrl_ficreg.envs.two_room.env import TwoRoomEnv

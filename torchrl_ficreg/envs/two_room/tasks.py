@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_ficreg.envs.two_room.dynamics import TWO_ROOM, TwoRoomGeometry
+from torchrl_ficreg.envs.two_room.physics import TWO_ROOM, TwoRoomGeometry
 
 MIN_STEPS = 25  # of a noiseless expert, as in the published data: 125 px through the door at 5 px per step
 

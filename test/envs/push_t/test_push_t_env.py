@@ -1,0 +1,271 @@
+"""PushT as an environment: contracts, draws, goals, restoration and what its pictures show."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from torchrl.envs.utils import check_env_specs
+
+pytest.importorskip("pymunk", reason="PushT needs pymunk")
+
+from torchrl_ficreg.envs import make_env  # noqa: E402
+from torchrl_ficreg.envs.push_t import tasks  # noqa: E402
+from torchrl_ficreg.envs.push_t.env import PushTEnv  # noqa: E402
+from torchrl_ficreg.envs.push_t.render import render  # noqa: E402
+
+START = np.array([100.0, 100.0, 300.0, 260.0, 0.1, 0.0, 0.0])
+
+
+def contact_actions(count=50):
+    rng = np.random.default_rng(0)
+    return (rng.normal(0, 0.4, (count, 2)) + 0.6 * np.sin(np.arange(count) / 6)[:, None]).astype(np.float32)
+
+
+def play(env, actions, **options):
+    observations = [env.reset(options=options)[0]]
+    observations += [env.step(action)[0] for action in actions]
+    return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
+
+
+# ---------------------------------------------------------------------- contracts
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"success_on": "block", "draw_goal": False}, {"legacy_restore": True}])
+def test_gymnasium_finds_nothing_to_complain_about(kwargs):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*Not able to test alternative render modes.*")
+        check_env(PushTEnv(image_size=32, **kwargs))
+
+
+@pytest.mark.parametrize("num_workers", [None, pytest.param(2, marks=pytest.mark.slow)])
+def test_torchrl_finds_its_specs_met(num_workers):
+    check_env_specs(make_env("push_t", image_size=32))
+    batch = make_env("torchrl_ficreg/PushT-v0", num_envs=2, num_workers=num_workers, image_size=32)
+    try:
+        check_env_specs(batch)
+        scenes = [{"options": {"state": START + i, "goal_state": START}} for i in range(2)]
+        reset = batch.reset(list_of_kwargs=scenes)
+        assert (reset["state"].numpy() == np.stack([START, START + 1])).all()
+    finally:
+        batch.close()
+
+
+def test_the_gymnasium_id_has_a_time_limit():
+    env = gymnasium.make("torchrl_ficreg/PushT-v0", image_size=8)
+    env.reset(seed=0, options={"state": START})
+    ends = [env.step(np.zeros(2, np.float32))[3] for _ in range(200)]
+    assert ends == [False] * 199 + [True]
+
+
+# ---------------------------------------------------------------------- restoration and pictures
+
+
+def test_an_episode_restored_twice_has_the_same_bits():
+    env = PushTEnv(image_size=64, terminate_on_success=False)
+    start = np.array([200.0, 190.0, 250.0, 250.0, 1.0, 20.0, -30.0])
+    first = play(env, contact_actions(), state=start, goal_state=START)
+    second = play(env, contact_actions(), state=start, goal_state=START)
+    assert np.ptp(first["state"][:, 2]) > 10  # the block moved
+    assert (first["state"][0] == start).all()
+    for key, values in first.items():
+        assert values.tobytes() == second[key].tobytes(), key
+
+
+def test_any_state_on_the_way_can_be_restored_and_shows_the_frame_recorded_there():
+    """Restored, not replayed: the picture is a function of the state, and the state comes back to the bit."""
+    env = PushTEnv(image_size=64, terminate_on_success=False)
+    record = play(env, contact_actions(), state=START, goal_state=START)
+    for state, picture in zip(record["state"][::7], record["pixels"][::7], strict=True):
+        observation, _ = env.reset(options={"state": state, "goal_state": state})
+        assert observation["state"].tobytes() == state.tobytes()
+        assert (observation["pixels"] == picture).all()
+        assert (observation["goal_pixels"] == picture).all()
+        assert (render(state, size=64) == picture).all()
+
+
+def test_a_contact_restored_in_the_middle_goes_on_within_a_few_pixels():
+    """The solver's memory of a contact is no part of the published state: the disc repeats itself, the block nearly."""
+    env = PushTEnv(image_size=8, terminate_on_success=False)
+    actions = contact_actions()
+    record = play(env, actions, state=np.array([200.0, 190.0, 250.0, 250.0, 1.0, 20.0, -30.0]))["state"]
+    apart = []
+    for begin in range(0, 40, 5):
+        again = play(env, actions[begin : begin + 10], state=record[begin])["state"][-1]
+        np.testing.assert_allclose(again[:2], record[begin + 10, :2], atol=1e-9)
+        apart.append(np.linalg.norm(again[2:4] - record[begin + 10, 2:4]))
+    assert np.median(apart) < 1.5
+    assert max(apart) < 6
+
+
+def test_legacy_restoration_steps_once_after_the_goal_and_once_after_the_start():
+    """The agent is carried on by 0.01 s of its velocity, and an overlap at the goal pushes the block of the start."""
+    goal = np.array([250.0, 250.0, 250.0, 250.0, 1.0, 0.0, 0.0])  # the disc is inside the block
+    start = np.array([60.0, 60.0, 250.0, 250.0, 1.0, 100.0, -50.0])
+    options = {"state": start, "goal_state": goal}
+    env = PushTEnv(image_size=64, legacy_restore=True)
+    got = [env.reset(options=options)[0] for _ in range(2)]
+    np.testing.assert_allclose(got[0]["state"][:2], [61.0, 59.5], atol=1e-12)
+    assert 0.1 < np.abs(got[0]["state"][2:4] - start[2:4]).max() < 5
+    assert (got[0]["state"] == got[1]["state"]).all()
+    assert (got[0]["goal_state"] == goal).all()
+    assert (got[0]["pixels"] == render(got[0]["state"], size=64)).all()
+    exact, _ = PushTEnv(image_size=64).reset(options=options)
+    assert (exact["state"] == start).all()
+
+
+# ---------------------------------------------------------------------- draws
+
+
+def test_starts_and_goals_fill_their_ranges_and_overlap_nothing():
+    states = np.array([tasks.sample_state(np.random.default_rng(seed)) for seed in range(400)])
+    assert all(tasks.is_free(state) for state in states)
+    assert (states[:, 5:] == 0).all()
+    for column, low, high in [(0, 50, 450), (1, 50, 450), (2, 100, 400), (3, 100, 400), (4, 0, 2 * np.pi)]:
+        margin = 0.05 * (high - low)
+        assert low <= states[:, column].min() < low + margin
+        assert high - margin < states[:, column].max() <= high
+
+
+def test_a_free_scene_does_not_move_by_itself():
+    env = PushTEnv(image_size=8, terminate_on_success=False)
+    for seed in range(20):
+        start = env.reset(seed=seed)[0]["state"]
+        after = env.step(np.zeros(2))[0]["state"]
+        np.testing.assert_allclose(after[:5], start[:5], atol=1e-9)
+
+
+def test_published_draws_keep_overlaps():
+    """14 in a hundred: 9 with the agent in the block, 5 with the block in a wall (measured over 4000 draws)."""
+    rng = np.random.default_rng(0)
+    states = [tasks.sample_state(rng, legacy_draws=True) for _ in range(1000)]
+    rejected = 1 - np.mean([tasks.is_free(state) for state in states])
+    assert 0.11 < rejected < 0.17
+
+
+@pytest.mark.parametrize(
+    ("state", "free"),
+    [
+        ([256.0, 184.9, 256.0, 200.0, 0.0], True),  # above the bar, 15.1 px away
+        ([256.0, 185.1, 256.0, 200.0, 0.0], False),
+        ([286.1, 280.0, 256.0, 200.0, 0.0], True),  # beside the stem, in the corner under the bar
+        ([285.9, 280.0, 256.0, 200.0, 0.0], False),
+        ([60.0, 60.0, 256.0, 384.0, 0.0], True),  # the stem ends at 504, where the wall begins
+        ([60.0, 60.0, 256.0, 384.1, 0.0], False),
+        ([60.0, 60.0, 256.0, 384.1, np.pi], True),  # turned over
+    ],
+)
+def test_overlaps_are_told_to_a_tenth_of_a_pixel(state, free):
+    assert tasks.is_free(np.array([*state, 0.0, 0.0])) is free
+
+
+def test_the_seed_fixes_the_episode():
+    first, second, other = (PushTEnv(image_size=8).reset(seed=seed)[0] for seed in (3, 3, 4))
+    assert all((first[key] == second[key]).all() for key in first)
+    assert (first["state"] != other["state"]).any()
+    assert (first["state"] != first["goal_state"]).any()
+
+
+# ---------------------------------------------------------------------- success
+
+
+def offset(**changes):
+    state = START.copy()
+    for name, value in changes.items():
+        state[["agent_x", "agent_y", "block_x", "block_y", "angle"].index(name)] += value
+    return state
+
+
+@pytest.mark.parametrize(
+    ("state", "on_state", "on_block"),
+    [
+        (offset(), True, True),
+        (offset(agent_x=19.9), True, True),
+        (offset(agent_x=20.0), False, True),
+        (offset(agent_x=300.0), False, True),
+        (offset(block_y=-19.9), True, True),
+        (offset(block_y=-20.0), False, False),
+        (offset(agent_x=14.0, agent_y=1.0, block_x=14.0, block_y=-2.0), True, True),  # sqrt(397)
+        (offset(agent_x=12.0, agent_y=8.0, block_x=-12.0, block_y=8.0), False, True),  # sqrt(416)
+        (offset(block_x=14.2, block_y=14.2), False, False),
+        (offset(angle=np.pi / 9 - 1e-6), True, True),
+        (offset(angle=np.pi / 9 + 1e-6), False, False),
+        (offset(angle=2 * np.pi - 0.3), True, True),  # 0.3 rad the other way, through zero
+        (offset(angle=2 * np.pi - 0.4), False, False),
+        (offset(angle=np.pi), False, False),
+    ],
+)
+def test_success_at_both_sides_of_its_thresholds(state, on_state, on_block):
+    for rule, reached in {"state": on_state, "block": on_block}.items():
+        assert tasks.is_success(state, START, success_on=rule) is reached
+        assert tasks.is_success(START, state, success_on=rule) is reached
+        env = PushTEnv(image_size=8, success_on=rule)
+        state[4] %= 2 * np.pi
+        assert env.reset(options={"state": state, "goal_state": START})[1]["success"].tolist() == [reached]
+
+
+def test_success_ends_an_episode_and_pays():
+    env = PushTEnv(image_size=8)
+    env.reset(options={"state": START, "goal_state": offset(agent_x=40.0)})
+    _, reward, terminated, truncated, info = env.step(np.array([1.0, 0.0]))
+    assert (reward, terminated, truncated, info["success"].tolist()) == (1.0, True, False, [True])
+
+
+# ---------------------------------------------------------------------- errors
+
+
+def test_states_recorded_far_outside_the_window_are_legal():
+    """200 steps at full speed from the edge of the draws: 200 * 40.7 + 450 px."""
+    env = PushTEnv(image_size=8, terminate_on_success=False)
+    env.reset(options={"state": np.array([450.0, 450.0, 200.0, 200.0, 0.0, 0.0, 0.0])})
+    for _ in range(200):
+        observation = env.step(np.ones(2))[0]
+    assert observation["state"][0] > 8000
+    assert env.observation_space.contains(observation)
+    assert (env.reset(options={"state": observation["state"]})[0]["state"] == observation["state"]).all()
+
+
+def test_an_angle_rounded_to_float32_is_legal():
+    state = START.copy()
+    state[4] = np.nextafter(2 * np.pi, 0)
+    state = state.astype(np.float32).astype(np.float64)
+    assert state[4] > 2 * np.pi
+    assert (PushTEnv(image_size=8).reset(options={"state": state})[0]["state"] == state).all()
+
+
+@pytest.mark.parametrize(
+    ("index", "value", "reason"),
+    [
+        (4, -0.1, r"the angle, state\[4\], leaves \[0, 2 pi\): take it modulo 2 pi"),
+        (4, 6.3, r"the angle, state\[4\], leaves"),
+        (0, -10_001.0, r"a coordinate or a velocity leaves \[-10000, 10000\]"),
+        (6, 10_001.0, "a coordinate or a velocity leaves"),
+    ],
+)
+def test_illegal_states_are_refused_with_a_reason(index, value, reason):
+    state = START.copy()
+    state[index] = value
+    with pytest.raises(ValueError, match=reason):
+        PushTEnv(image_size=8).reset(options={"goal_state": state})
+
+
+def test_bad_arguments_are_refused():
+    with pytest.raises(ValueError, match=r"success_on must be one of \('state', 'block'\), got 'agent'"):
+        PushTEnv(success_on="agent")
+    with pytest.raises(ValueError, match="image_size must be a positive integer"):
+        PushTEnv(image_size=0)
+    env = PushTEnv(image_size=8)
+    with pytest.raises(ValueError, match=r"must have shape \(7,\), got \(5,\)"):
+        env.reset(options={"state": np.zeros(5)})
+
+
+def test_large_actions_are_obeyed():
+    env = PushTEnv(image_size=8, terminate_on_success=False)
+    env.reset(options={"state": START})
+    assert env.step(np.array([0.0, 2.0]))[0]["state"][1] - START[1] == pytest.approx(2 * 29.57, abs=0.02)
+    assert torch.equal(torch.as_tensor(env.action_space.high), torch.ones(2))

@@ -1,0 +1,111 @@
+"""Claims about the presets: published sizes to the last parameter, and the same numbers as in the recipes."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from torchrl_ficreg import make_world_model, ModelConfig
+from torchrl_ficreg.modules.config import PRESETS
+
+RECIPES = Path(__file__).parents[2] / "sota-implementations" / "ficreg" / "config" / "model"
+
+
+def count(*modules):
+    return sum(param.numel() for module in modules for param in module.parameters())
+
+
+@pytest.fixture(scope="module")
+def paper():
+    with torch.device("meta"):
+        return make_world_model(ModelConfig.preset("paper"), action_dim=2)
+
+
+def test_the_paper_preset_has_the_published_parameters(paper):
+    """LeWM's released PushT weights (arXiv 2603.19312): 18,034,478, part by part."""
+    model, _ = paper
+    encoder, predictor = model.encoder.module, model.predictor.module
+    assert count(model) == 18_034_478
+    assert count(encoder) - count(encoder.projector) == 5_501_376
+    assert count(encoder.projector) == count(predictor.projector) == 792_768
+    assert count(predictor.action_embedding) == 156_206
+    assert count(predictor) - count(predictor.projector, predictor.action_embedding) == 10_791_360
+
+
+def test_the_inverse_model_is_an_mlp_of_width_512(paper):
+    """FICReg, appendix B: 2 * 192 -> 512 -> 512 -> 5 * 2."""
+    assert count(paper[1]) == (384 + 1) * 512 + (512 + 1) * 512 + (512 + 1) * 10
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_is_the_model_section_of_its_recipe(name):
+    recipe = OmegaConf.load(RECIPES / f"{name}.yaml")
+    bases = [OmegaConf.load(RECIPES / f"{base}.yaml") for base in recipe.get("defaults", []) if base != "_self_"]
+    recipe = OmegaConf.to_container(OmegaConf.merge(*bases, recipe).model)
+    assert recipe.pop("preset") == name
+    preset = ModelConfig.preset(name)
+    assert set(recipe) == {field.name for field in fields(ModelConfig)}
+    assert ModelConfig(**recipe) == preset
+
+
+@pytest.mark.parametrize("action_dim", [1, 5])
+def test_sizes_reach_the_networks(action_dim):
+    config = ModelConfig.preset("cpu", frame_skip=3, latent_dim=7, history=2, inverse_hidden_dim=11, predictor_depth=1)
+    model, inverse_model = make_world_model(config, action_dim)
+    assert (model.frame_skip, model.history, len(model.action_mean)) == (3, 2, action_dim)
+    model.eval()
+    latent = model.encode(torch.zeros(2, 3, 64, 64))
+    assert latent.shape == (2, 7)
+    assert model.rollout(latent[:, None], torch.zeros(2, 4, 3 * action_dim)).shape == (2, 4, 7)
+    assert inverse_model(latent=latent, next_latent=latent).shape == (2, 3 * action_dim)
+
+
+def test_a_preset_can_be_changed_and_is_not_changed_by_it():
+    assert ModelConfig.preset("cpu", latent_dim=3).latent_dim == 3
+    assert ModelConfig.preset("cpu").latent_dim != 3
+
+
+def test_numbers_may_come_from_json():
+    """Lists become tuples, so that a configuration read back equals the one written."""
+    assert ModelConfig(conv_channels=[4, 8]) == ModelConfig(conv_channels=(4, 8))
+
+
+def test_no_dropout_is_a_choice_however_it_is_written():
+    assert ModelConfig(predictor_dropout=0) == ModelConfig(predictor_dropout=0.0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"encoder": "resnet"}, "unknown encoder 'resnet': choose 'vit', 'conv' or 'keypoint'"),
+        ({"latent_dim": 0, "history": -1}, "positive, got latent_dim=0, history=-1"),
+        ({"conv_channels": (4, 0)}, r"positive, got conv_channels=\(4, 0\)"),
+        ({"conv_channels": ()}, r"positive, got conv_channels=\(\)"),
+        ({"predictor_dropout": 1.0}, r"predictor_dropout must lie in \[0, 1\), got 1.0"),
+        ({"predictor_dropout": -0.1}, r"predictor_dropout must lie in \[0, 1\), got -0.1"),
+    ],
+)
+def test_impossible_sizes_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        ModelConfig(**wrong)
+
+
+def test_an_unknown_preset_is_refused():
+    with pytest.raises(ValueError, match=r"unknown preset 'tiny': choose one of \['cpu', 'gpu_short', 'paper'\]"):
+        ModelConfig.preset("tiny")
+
+
+def test_the_paper_preset_starts_from_the_published_weights():
+    """transformers' ViT: truncated normal 0.02 and no bias; the predictor's position embedding is N(0, 1)."""
+    torch.manual_seed(0)
+    config = ModelConfig.preset("paper", image_size=28, predictor_depth=1)
+    model, _ = make_world_model(config, action_dim=2)
+    network = model.encoder.module
+    for layer in (network.to_patch, *(part for part in network.blocks.modules() if isinstance(part, torch.nn.Linear))):
+        assert layer.weight.std().item() == pytest.approx(0.02, rel=0.02) and not layer.bias.any()
+    position = model.predictor.module.position
+    assert position.std().item() == pytest.approx(1.0, abs=4 / (2 * position.numel()) ** 0.5)

@@ -1,0 +1,136 @@
+"""From a name to a TorchRL environment that speaks the package's key contract."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.envs.registration import EnvSpec
+from torchrl.data import Binary, Composite
+from torchrl.envs import EnvBase, GymWrapper, SerialEnv
+from torchrl.envs.gym_like import default_info_dict_reader
+
+from torchrl_ficreg.envs.base import GoalEnv
+from torchrl_ficreg.envs.batched import WorkerGroupsEnv
+from torchrl_ficreg.envs.registry import find_entry
+from torchrl_ficreg.keys import STATE, SUCCESS
+
+_TORCHRL_STATE = "observation"  # what GymWrapper calls an observation named "state"
+
+
+class GoalGymWrapper(GymWrapper):
+    """TorchRL's view of a :class:`~torchrl_ficreg.envs.base.GoalEnv`, with the key names of the package.
+
+    Root keys: ``pixels`` and ``goal_pixels`` [3, H, W] uint8, ``state`` and ``goal_state`` [S] float64, ``success``
+    [1] bool, at resets too. TorchRL renames an observation called ``state``; this class keeps its name.
+
+    Args:
+        env: a Gymnasium environment, wrapped or not, around a :class:`~torchrl_ficreg.envs.base.GoalEnv`.
+
+    Raises:
+        TypeError: another kind of environment.
+    """
+
+    def __init__(self, env: gymnasium.Env, **kwargs: Any) -> None:
+        if not isinstance(env.unwrapped, GoalEnv):
+            raise TypeError(f"expected a GoalEnv, got {type(env.unwrapped).__name__}: subclass GoalEnv.")
+        super().__init__(env=env, **kwargs)
+        spec = Composite({SUCCESS: Binary(n=1, shape=(1,), dtype=torch.bool)})
+        self.set_info_dict_reader(default_info_dict_reader([SUCCESS], spec=spec))
+
+    def _make_specs(self, env: gymnasium.Env, batch_size: torch.Size | None = None) -> None:
+        super()._make_specs(env, batch_size)
+        specs = dict(self.observation_spec.items())
+        specs[STATE] = specs.pop(_TORCHRL_STATE)
+        self.observation_spec = Composite(specs, shape=self.observation_spec.shape)
+
+    def read_obs(self, observations: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """Turns the arrays of an observation into tensors under their own names; contiguous ones are not copied."""
+        return {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in observations.items()}
+
+
+def make_env(
+    name: str = "two_room",
+    num_envs: int = 1,
+    *,
+    image_size: int = 64,
+    terminate_on_success: bool = True,
+    max_episode_steps: int | None = None,
+    num_workers: int | None = None,
+    seed: int | None = None,
+    **env_kwargs: Any,
+) -> EnvBase:
+    """Builds one environment or a batch of them.
+
+    A batch is reset to given scenes by one dictionary per environment::
+
+        env.reset(list_of_kwargs=[{"options": {"state": s, "goal_state": g}} for s, g in pairs])
+
+    Args:
+        name: a short name of :data:`~torchrl_ficreg.envs.registry.ENVIRONMENTS`, or any Gymnasium id whose
+            environment is a :class:`~torchrl_ficreg.envs.base.GoalEnv`.
+        num_envs: 1 for an environment without batch dimension, more for one of batch size [num_envs].
+        image_size: height and width of the pictures, in pixels.
+        terminate_on_success: end an episode once its goal is reached.
+        max_episode_steps: truncate after so many steps; None for no limit.
+        num_workers: None to step the batch in this process; W for W processes with one thread each, among which the
+            environments are divided evenly. Same results bit for bit; it pays when drawing is slow, one process per
+            core. A script then needs the usual ``if __name__ == "__main__":``. A single environment always lives in
+            this process.
+        seed: makes the environments' draws reproducible; each environment of a batch gets its own seed from it.
+        **env_kwargs: passed to the environment's constructor.
+
+    Returns:
+        the environment; root keys as in :class:`GoalGymWrapper`.
+
+    Raises:
+        ValueError: an unknown name, or a number out of range.
+        TypeError: the environment is not a :class:`~torchrl_ficreg.envs.base.GoalEnv`.
+
+    Examples:
+        >>> env = make_env("two_room", num_envs=2, seed=0)
+        >>> env.rollout(3, break_when_any_done=False)["pixels"].shape
+        torch.Size([2, 3, 3, 64, 64])
+    """
+    counts = {"num_envs": num_envs, "num_workers": num_workers, "seed": seed, "max_episode_steps": max_episode_steps}
+    for word, value in counts.items():
+        if (value is not None or word == "num_envs") and (not isinstance(value, int) or isinstance(value, bool)):
+            raise ValueError(f"{word} must be an integer, got {value!r}.")
+    if num_envs < 1:
+        raise ValueError(f"num_envs must be at least 1, got {num_envs}.")
+    if num_workers is not None and not 1 <= num_workers <= num_envs:
+        raise ValueError(f"num_workers must be None or in 1..num_envs ({num_envs}), got {num_workers}.")
+    if seed is not None and seed < 0:
+        raise ValueError(f"seed must not be negative, got {seed}.")
+    if max_episode_steps is not None and max_episode_steps < 1:
+        raise ValueError(f"max_episode_steps must be at least 1, or None for no limit, got {max_episode_steps}.")
+    create = functools.partial(
+        _make_single,
+        _gym_spec(name),
+        max_episode_steps,
+        image_size=image_size,
+        terminate_on_success=terminate_on_success,
+        **env_kwargs,
+    )
+    if num_envs == 1:
+        env = create()
+    elif num_workers is None:
+        env = SerialEnv(num_envs, create)
+    else:
+        env = WorkerGroupsEnv(num_envs, create, num_workers)
+    if seed is not None:
+        env.set_seed(seed)
+    return env
+
+
+def _make_single(gym_spec: EnvSpec, max_episode_steps: int | None, **kwargs: Any) -> GoalGymWrapper:
+    limit = -1 if max_episode_steps is None else max_episode_steps  # Gymnasium's None means the id's own limit
+    return GoalGymWrapper(gymnasium.make(gym_spec, max_episode_steps=limit, disable_env_checker=True, **kwargs))
+
+
+def _gym_spec(name: str) -> EnvSpec:
+    """The whole entry, not its id: a worker process has not seen what the caller registered."""
+    return gymnasium.spec(name if name in gymnasium.registry else find_entry(name).gym_id)

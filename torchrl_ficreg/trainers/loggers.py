@@ -1,0 +1,307 @@
+"""Loggers: a CSV table on disk, and a wrapper under which a lost logger does not end the run."""
+
+from __future__ import annotations
+
+import atexit
+import csv
+import io
+import os
+import queue
+import re
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils._pytree import tree_map
+from torchrl import torchrl_logger
+from torchrl.record.loggers import Logger
+
+from torchrl_ficreg._utils import BINARY, NO_FOLLOW, NO_WAIT, read_bytes, write_all, write_atomic
+
+
+_STEP = re.compile(r"\d{1,18}", re.ASCII)
+
+
+class CsvRows:
+    """Appends rows to a CSV file. A row may bring new columns: the file is then rewritten, in one piece, with them.
+
+    When the disk is full, or the file cannot be written for another reason, a warning is given once, what was written
+    of the row is taken back, and rows wait in memory until there is room again.
+
+    Args:
+        path: the file; made, with its folder, by the first row.
+        first: columns that come first, whether or not a row has them yet.
+
+    Examples:
+        >>> import tempfile
+        >>> rows = CsvRows(Path(tempfile.mkdtemp()) / "table.csv")
+        >>> rows.append({"step": 1, "loss": 0.5})
+        >>> rows.append({"step": 2, "rank": 3.0})
+        >>> rows.path.read_text().split()
+        ['step,loss,rank', '1,0.5,', '2,,3']
+    """
+
+    def __init__(self, path: Path, first: Iterable[str] = ()) -> None:
+        self.path, self._first = path, tuple(first)
+        self._columns: list[str] | None = None
+        self._waiting: list[dict[str, Any]] = []
+        self._warned = False
+
+    def append(self, row: dict[str, Any]) -> None:
+        """Writes a row, and those that waited for room."""
+        self._waiting.append(row)
+        try:
+            self._flush()
+        except OSError as error:
+            if not self._warned:
+                torchrl_logger.warning(f"{self.path} cannot be written ({error}): rows wait in memory until it can be.")
+            self._warned = True
+        else:
+            self._warned = False
+
+    def _flush(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        present, old = self._header(), []
+        columns = list(dict.fromkeys([*(present or self._first), *(key for row in self._waiting for key in row)]))
+        if columns != present:
+            if present:
+                header, rows = _read(self.path)
+                old = [dict(zip(header, row)) for row in rows]
+            self._replace(columns, [*old, *self._waiting])
+        else:
+            _append(self.path, _lines(columns, self._waiting))
+        self._columns, self._waiting = columns, []
+
+    def _header(self) -> list[str] | None:
+        """Columns of the file; None where there is no file, or none with a header."""
+        if self._columns is None and self.path.exists():
+            self._columns = _read(self.path)[0] or None
+        return self._columns if self.path.exists() else None
+
+    def _replace(self, columns: list[str], rows: list[dict[str, Any]]) -> None:
+        write_atomic(self.path, _lines(columns, [dict(zip(columns, columns)), *rows]))
+
+    def drop_after(self, step: int) -> None:
+        """Removes whole rows of later steps, and torn or damaged ones of any, in one piece.
+
+        Raises:
+            ValueError: the header is damaged, or there is no regular file.
+        """
+        self._columns, self._waiting = None, []
+        if not self.path.exists():
+            return
+        header, rows = _read(self.path)  # a kill may leave an empty file
+        whole = [row for row in rows if len(row) == len(header) and _STEP.fullmatch(row[0])]
+        kept = [dict(zip(header, row)) for row in whole if int(row[0]) <= step]
+        if kept:
+            self._replace(header, kept)
+        else:
+            self.path.unlink()
+
+
+def _read(path: Path) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of a table; rows that cannot be read are left out.
+
+    Raises:
+        ValueError: the header cannot be read, or there is no regular file.
+    """
+    first, *lines = read_bytes(path).decode(errors="replace").split("\n")
+    try:
+        header = next(csv.reader([first]), [])
+    except csv.Error as error:
+        raise ValueError(f"{path} is damaged ({error}, in its first line): restore it, or move it away.") from error
+    rows = []
+    for line in lines:
+        try:
+            rows += csv.reader([line])
+        except csv.Error:  # a field of more than 128 kB
+            continue
+    return header, [row for row in rows if row]
+
+
+def _lines(columns: list[str], rows: list[dict[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="")
+    writer.writerows({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()} for row in rows)
+    return text.getvalue()
+
+
+def _append(path: Path, text: str) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | NO_FOLLOW | NO_WAIT | BINARY)
+    try:
+        before = os.fstat(descriptor).st_size
+        try:
+            write_all(descriptor, text.encode())
+        except OSError:
+            os.ftruncate(descriptor, before)
+            raise
+    finally:
+        os.close(descriptor)
+
+
+class TolerantLogger:
+    """Passes every call on to a TorchRL logger until one fails or hangs, then warns once and passes on no more.
+
+    A server that cannot be reached, one that no longer answers, or a full disk below its files must not end or hold up a
+    training of days: ``metrics.csv`` has the same numbers. Calls are made one after another by a daemon thread, so they
+    return None at once; a call made by another one, in that thread, is made in its place. Arrays and tensors are copied.
+
+    Nor does a checkpoint depend on a logger: this one has no state, so that a run may continue with another logger or none.
+
+    Args:
+        logger: any; what is not a method is read from it as before.
+        timeout: seconds after which a call in progress counts as hung, and that :meth:`flush` waits at most.
+        max_calls: calls that may wait; when there are more, the next one waits for room, up to ``timeout``.
+
+    Attributes:
+        lost: whether it has failed or hung.
+
+    Raises:
+        ValueError: timeout or max_calls are not positive.
+
+    Examples:
+        >>> class Server:
+        ...     def log_scalar(self, name, value, step=None):
+        ...         raise ConnectionError("no route to host")
+        >>> logger = TolerantLogger(Server())
+        >>> logger.log_scalar("loss", 0.5)
+        >>> logger.flush()
+        >>> logger.lost
+        True
+    """
+
+    state_dict = load_state_dict = None
+
+    def __init__(self, logger: Logger, *, timeout: float = 60.0, max_calls: int = 1000) -> None:
+        if not timeout > 0 or max_calls < 1:
+            raise ValueError(f"timeout and max_calls must be positive, got {timeout} and {max_calls}.")
+        self._logger, self._timeout, self.lost = logger, timeout, False
+        self._calls: queue.Queue[tuple] = queue.Queue(max_calls)
+        self._worker: threading.Thread | None = None
+        self._began: float | None = None  # when the call in progress did
+        self._telling = threading.Lock()
+        _unhook_wandb()
+        atexit.register(_flush, weakref.ref(self))  # runs before what the logger's package registered earlier
+
+    @classmethod
+    def around(cls, logger: Logger | TolerantLogger | None) -> TolerantLogger | None:
+        """Makes a logger tolerant that is not yet."""
+        return logger if logger is None or isinstance(logger, cls) else cls(logger)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "_logger":  # of a copy that is being made
+            raise AttributeError(name)
+        value = getattr(self._logger, name)
+        return self._guard(value) if callable(value) and not name.startswith("_") else value
+
+    def attempt(self, work: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Has a function that talks to the logger's backend called under the same rule, after the calls before it.
+
+        Returns:
+            None; inside a call in progress, what the function returns.
+        """
+        if threading.current_thread() is self._worker:
+            return self._call(work, args, kwargs)
+        if self._began is not None and time.monotonic() - self._began > self._timeout:
+            self._hung()
+        if self.lost:
+            return None
+        if self._worker is None or not self._worker.is_alive():
+            self._worker = threading.Thread(target=self._work, name="logger", daemon=True)
+            self._worker.start()
+        try:
+            self._calls.put((work, *tree_map(_copy, (args, kwargs))), timeout=self._timeout)
+        except queue.Full:
+            self._hung()
+
+    def flush(self, timeout: float | None = None) -> None:
+        """Waits until every call so far was made.
+
+        Args:
+            timeout: most seconds to wait, after which the logger counts as hung; None: that of the class.
+        """
+        deadline = time.monotonic() + (self._timeout if timeout is None else timeout)
+        with self._calls.all_tasks_done:
+            while self._calls.unfinished_tasks and not self.lost and (left := deadline - time.monotonic()) > 0:
+                self._calls.all_tasks_done.wait(min(left, 1.0))
+            waiting = self._calls.unfinished_tasks
+        if waiting:
+            self._hung()
+
+    def shutdown(self, *args: Any, **kwargs: Any) -> None:
+        """Closes the logger after all calls so far, and waits for that as :meth:`flush` does."""
+        self.attempt(self._logger.shutdown, *args, **kwargs)
+        self.flush()
+
+    close = shutdown
+
+    def _work(self) -> None:
+        while True:
+            call = self._calls.get()
+            self._began = time.monotonic()
+            self._call(*call)
+            self._began = None
+            self._calls.task_done()
+
+    def _call(self, work: Callable[..., Any], args: tuple, kwargs: dict[str, Any]) -> Any:
+        if self.lost:
+            return None
+        try:
+            return work(*args, **kwargs)
+        except BaseException as error:  # of any kind: what a backend raises is its own affair, and the thread must live on
+            self._lose(f"{type(error).__name__}: {error}")
+
+    def _hung(self) -> None:
+        if not self.lost:
+            self._lose(f"no answer within {self._timeout:g} s")
+            _leave_wandb()
+
+    def _lose(self, reason: str) -> None:
+        with self._telling:
+            if self.lost:
+                return
+            self.lost = True
+        torchrl_logger.warning(f"{type(self._logger).__name__} is lost ({reason}): the run goes on without it.")
+
+    def _guard(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *args, **kwargs: self.attempt(method, *args, **kwargs)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._logger!r})"
+
+
+def _copy(value: Any) -> Any:
+    """A tensor or an array that its owner may overwrite before the call is made."""
+    if isinstance(value, torch.Tensor):
+        return value.detach().clone()
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+def _flush(logger: weakref.ref[TolerantLogger]) -> None:
+    """At exit, where a daemon thread would end in the middle of its calls."""
+    if (alive := logger()) is not None:
+        alive.flush()
+
+
+def _unhook_wandb() -> None:
+    """Has no import report to wandb's service: when that is gone, the import would fail, in whatever thread it is."""
+    hooks = sys.modules.get("wandb.sdk.lib.import_hooks")
+    if hooks is not None:
+        hooks.unregister_all_post_import_hooks()
+
+
+def _leave_wandb() -> None:
+    """Has the exit of this process not wait for a wandb service that does not answer.
+
+    The service ends by itself when its parent is gone. Nothing public does this; another version of wandb waits.
+    """
+    setup = getattr(sys.modules.get("wandb.sdk.wandb_setup"), "_singleton", None)
+    forget = getattr(getattr(setup, "_connection", None), "_cleanup", None)  # unregisters wandb's own exit handler
+    if callable(forget):
+        forget()

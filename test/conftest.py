@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 
 import pytest
@@ -82,3 +83,10 @@ def fast_bf16(request, monkeypatch) -> bool:
     """Whether this processor is taken for one with fast bfloat16 products: a test runs once for each."""
     monkeypatch.setattr("torchrl_ficreg._device.has_fast_bf16", lambda device, kind="products": request.param)
     return request.param
+
+
+@pytest.fixture(autouse=True, scope="session")
+def interruptible():
+    """Shells start background jobs with SIGINT ignored, and children inherit that: Ctrl-C works in tests all the same."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,4 +1,4 @@
-"""How a device is used: numeric precision, and memory that is kept between steps."""
+"""Use of a device: numeric precision, and the setting of the memory allocator."""
 
 from __future__ import annotations
 
@@ -10,48 +10,54 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from typing import get_args, Literal
 
 import torch
 import torch.nn.functional as F
 
-
 Precision = Literal["auto", "fp32", "bf16"]
 Kind = Literal["products", "convolutions"]
-FAST = 1.25  # times float32 from which bfloat16 is worth its rounding
+MIN_SPEEDUP = 1.25  # of bfloat16 over float32 from which "auto" uses it
 
 
 def has_fast_bf16(device: torch.device | str, kind: Kind = "products") -> bool:
-    """Whether bfloat16 is faster than float32: on CUDA from Ampere on, on CPUs where :func:`bf16_speedup` says so.
+    """Whether bfloat16 is faster than float32: on CUDA devices from Ampere on; on CPUs :func:`bf16_speedup` decides.
 
     Args:
-        device: a device, or its name.
-        kind: matrix products or convolutions. A CPU can be fast at one and slow at the other.
+        device (torch.device or str): the device.
+        kind (str, optional): ``"products"`` (matrix products) or ``"convolutions"``. A CPU can be fast at one and slow at
+            the other. Default: ``"products"``.
+
+    Examples:
+        >>> has_fast_bf16("mps")
+        False
     """
     device = torch.device(device)
     if device.type == "cuda":
         return torch.cuda.get_device_capability(device)[0] >= 8
-    return device.type == "cpu" and bf16_speedup(kind) >= FAST
+    return device.type == "cpu" and bf16_speedup(kind) >= MIN_SPEEDUP
 
 
-_measuring = threading.Lock()  # two at once would disturb each other, and lose the number of threads they restore
+_measuring = threading.Lock()  # two measurements at once would disturb each other's times and number of threads
 _speedups: dict[tuple[Kind, bool], float] = {}
 
 
 @torch.compiler.assume_constant_result
 def bf16_speedup(kind: Kind = "products") -> float:
-    """How many times faster than float32 this CPU trains a layer in bfloat16, measured once per process.
+    """Speed of a layer's training step in bfloat16 relative to float32 on this CPU, measured once per process.
 
-    Takes some tens of milliseconds at the first call. What a processor says of itself does not tell: oneDNN computes
+    The first call takes some tens of milliseconds. The feature flags of the processor are not sufficient: oneDNN computes
     bfloat16 on any processor with AVX-512, at a third of the speed of float32 where the instructions are missing or
-    switched off (``ONEDNN_MAX_CPU_ISA``). Typical figures: 10 with AMX, 2 with AVX512_BF16, below 0.5 elsewhere.
+    disabled (``ONEDNN_MAX_CPU_ISA``). Typical values: 10 with AMX, 2 with AVX512_BF16, below 0.5 elsewhere.
+
+    Args:
+        kind (str, optional): ``"products"`` or ``"convolutions"``. Default: ``"products"``.
 
     Raises:
         KeyError: an unknown kind.
     """
-    # The modes of torch belong to a thread: in a new one no tensor is fake, traced, mapped or recorded.
-    case = kind, torch.backends.mkldnn.enabled  # torch.export switches oneDNN off while it traces
+    # The modes of torch are local to a thread: in a new one no tensor is fake, traced, mapped or recorded.
+    case = kind, torch.backends.mkldnn.enabled  # torch.export disables oneDNN while it traces
     with _measuring:
         if case not in _speedups:
             with ThreadPoolExecutor(1) as thread:
@@ -62,23 +68,23 @@ def bf16_speedup(kind: Kind = "products") -> float:
 def _measure(kind: Kind) -> float:
     make = {"products": _product, "convolutions": _convolution}[kind]
     least, threads = {}, torch.get_num_threads()
-    torch.set_num_threads(1)  # threads wait for each other on a busy machine; the time of one is its own
+    torch.set_num_threads(1)  # on a busy machine, several threads wait for each other
     try:
         layers = {dtype: make(dtype) for dtype in (torch.float32, torch.bfloat16)}
-        for turn in range(5):  # kernels are prepared in the first
+        for turn in range(5):  # the first one prepares the kernels
             for dtype, layer in layers.items():
                 began = time.thread_time()
                 layer()
                 if turn:
                     least[dtype] = min(least.get(dtype, float("inf")), time.thread_time() - began)
             if turn and least[torch.bfloat16] > 1.5 * least[torch.float32]:
-                break  # no further turn will make up for that
+                break  # clearly slower: no further turn is needed
     finally:
         torch.set_num_threads(threads)
     return least[torch.float32] / least[torch.bfloat16]
 
 
-# Gradients without autograd, which a process forked from one that trains on a GPU cannot use.
+# Without autograd, which does not work in a process forked from one that trains on a GPU.
 def _product(dtype: torch.dtype) -> Callable[[], object]:
     """A linear layer of 512 rows, as wide as the paper's networks, forward and backward."""
     x, weight = torch.ones(512, 192, dtype=dtype, device="cpu"), torch.ones(768, 192, dtype=dtype, device="cpu")
@@ -99,15 +105,12 @@ def _convolution(dtype: torch.dtype) -> Callable[[], object]:
     )
 
 
-@cache
-def has_amx() -> bool:
-    """Whether the CPU multiplies bfloat16 in tiles (Intel's AMX), ten times as fast as float32."""
-    known = getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)()
-    return bool(known) and has_fast_bf16("cpu")
-
-
 def uses_bf16(device: torch.device | str, precision: Precision = "auto") -> bool:
-    """Whether to compute in bfloat16: ``"bf16"`` always, ``"fp32"`` never, ``"auto"`` where products in it are fast.
+    """Whether to compute in bfloat16: ``"bf16"`` always, ``"fp32"`` never, ``"auto"`` if :func:`has_fast_bf16`.
+
+    Args:
+        device (torch.device or str): the device.
+        precision (str, optional): ``"auto"``, ``"bf16"`` or ``"fp32"``. Default: ``"auto"``.
 
     Raises:
         ValueError: an unknown precision.
@@ -117,25 +120,29 @@ def uses_bf16(device: torch.device | str, precision: Precision = "auto") -> bool
 
 
 def check_precision(precision: str) -> None:
-    """Refuses an unknown precision.
+    """Checks the name of a precision.
 
     Raises:
-        ValueError: other than ``"auto"``, ``"fp32"`` and ``"bf16"``.
+        ValueError: it is not ``"auto"``, ``"fp32"`` or ``"bf16"``.
     """
     if precision not in ("auto", "fp32", "bf16"):
         raise ValueError(f"unknown precision {precision!r}: choose 'auto', 'fp32' or 'bf16'.")
 
 
 def autocast(device: torch.device | str, precision: Precision = "auto") -> torch.autocast:
-    """A bfloat16 autocast region on the device where :func:`uses_bf16` says so, else a region that changes nothing.
+    """Context: bfloat16 autocast if :func:`uses_bf16`; without effect otherwise.
 
-    Convolutions of the package's encoders stay in float32 on a CPU that is slow at them in bfloat16, under ``"bf16"`` too.
+    Convolutions of the package's encoders stay in float32 on a CPU that is slow at them in bfloat16, with ``"bf16"`` too.
+
+    Args:
+        device (torch.device or str): the device.
+        precision (str, optional): ``"auto"``, ``"bf16"`` or ``"fp32"``. Default: ``"auto"``.
     """
     return torch.autocast(torch.device(device).type, dtype=torch.bfloat16, enabled=uses_bf16(device, precision))
 
 
 def convolution_region(device: torch.device) -> contextlib.AbstractContextManager:
-    """Within a region of :func:`autocast`: bfloat16 goes off on a CPU that is slow at convolutions in it."""
+    """Context inside :func:`autocast`: disables bfloat16 on a CPU that is slow at convolutions in it."""
     slow = device.type == "cpu" and in_autocast(device) and torch.get_autocast_dtype("cpu") == torch.bfloat16
     if slow and not has_fast_bf16(device, "convolutions"):
         return without_autocast(device)
@@ -143,7 +150,7 @@ def convolution_region(device: torch.device) -> contextlib.AbstractContextManage
 
 
 def describe_precision(device: torch.device | str, precision: Precision = "auto") -> str:
-    """One line for a log: the device, the precision in use, and on CPUs what it was chosen by.
+    """One line for a log: the device, the precision in use, and on CPUs the measurements that it is based on.
 
     Examples:
         >>> describe_precision("cuda:1", "fp32")
@@ -154,7 +161,7 @@ def describe_precision(device: torch.device | str, precision: Precision = "auto"
 
 
 def describe_processor() -> str:
-    """The CPU's name, the vector instructions that torch uses, and what bfloat16 is worth on it."""
+    """Name of the CPU, the vector instructions that torch uses, and its :func:`bf16_speedup`."""
     name = platform.processor() or platform.machine()
     with contextlib.suppress(OSError, StopIteration):
         with open("/proc/cpuinfo", encoding="utf-8") as lines:
@@ -165,40 +172,39 @@ def describe_processor() -> str:
 
 
 def without_autocast(device: torch.device) -> contextlib.AbstractContextManager:
-    """A region in which autocast is off, on devices that know none (meta) too."""
+    """Context without autocast; accepts devices that do not support autocast (meta)."""
     if not torch.amp.is_autocast_available(device.type):
         return contextlib.nullcontext()
     return torch.autocast(device.type, enabled=False)
 
 
 def in_autocast(device: torch.device) -> bool:
-    """Whether autocast is on for a device."""
+    """Whether autocast is enabled for a device."""
     return torch.amp.is_autocast_available(device.type) and torch.is_autocast_enabled(device.type)
 
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # parameters of glibc's mallopt
-KEPT = 256 * 2**20  # bytes
-_most = 0  # bytes that were asked for so far
+DEFAULT_KEPT_BYTES = 256 * 2**20
+_largest_kept = 0  # bytes, of all calls so far
 
 
-def keep_freed_memory(kept: int = KEPT, *, lower: bool = False) -> bool:
-    """Asks glibc to keep freed memory for the next tensor instead of handing its pages back to the kernel.
+def keep_freed_memory(kept: int = DEFAULT_KEPT_BYTES, *, allow_decrease: bool = False) -> bool:
+    """Makes glibc keep freed memory for the next tensor, instead of returning its pages to the kernel.
 
-    On CPUs, networks make and free tensors of some megabytes thousands of times a second. By default each gets fresh
-    pages that the kernel zeroes one fault at a time: a fifth of the time of a plan. The price is up to ``kept`` bytes
-    that stay with the process. A setting of the whole process; other systems and allocators are left alone.
+    On CPUs, networks allocate and free tensors of some megabytes thousands of times a second. By default each one gets
+    fresh pages, which the kernel zeroes one page fault at a time: a fifth of the time of a plan. The price is up to
+    ``kept`` bytes that stay with the process. The setting is global to the process; other systems and allocators are left
+    alone.
 
     Args:
-        kept: size up to which blocks are reused, and free memory at the top of the heap is kept, in bytes.
-        lower: also if more was asked for before. By default the most counts: a plan in the middle of training must not
-            take away what training keeps.
+        kept (int, optional): size in bytes up to which blocks are reused, and up to which free memory at the top of the
+            heap is kept. Default: 256 MiB.
+        allow_decrease (bool, optional): whether a smaller value replaces a larger one of an earlier call. By default the
+            largest counts, so that a plan during training does not undo the setting of the training.
+            Default: ``False``.
 
     Returns:
-        whether the allocator has such a setting.
-
-    Examples:
-        >>> keep_freed_memory() in (True, False)
-        True
+        whether the allocator accepted the setting.
     """
     if not sys.platform.startswith("linux"):
         return False
@@ -206,6 +212,6 @@ def keep_freed_memory(kept: int = KEPT, *, lower: bool = False) -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError):  # another C library
         return False
-    global _most
-    _most = kept = kept if lower else max(kept, _most)
+    global _largest_kept
+    _largest_kept = kept = kept if allow_decrease else max(kept, _largest_kept)
     return bool(mallopt(_MMAP_THRESHOLD, kept)) and bool(mallopt(_TRIM_THRESHOLD, kept))

@@ -1,7 +1,8 @@
-"""Lets TorchRL be imported where MuJoCo is installed and its GL library is not.
+"""Import of MuJoCo on machines without its GL library.
 
-TorchRL looks for ``mujoco.mjx``, for which Python imports MuJoCo, which loads the library that ``MUJOCO_GL`` names and
-fails where it is missing, or where the name is none. Imported before TorchRL, this module leaves MuJoCo loaded either way.
+TorchRL looks for ``mujoco.mjx``, for which Python imports MuJoCo. MuJoCo loads the GL library that ``MUJOCO_GL`` names,
+and its import fails if that library is missing or the name is unknown. The package imports this module before TorchRL,
+so that MuJoCo is loaded in any case.
 """
 
 from __future__ import annotations
@@ -10,21 +11,28 @@ import importlib
 import importlib.util
 import os
 import sys
+from types import ModuleType
 
 
-def load() -> None:
-    """Imports MuJoCo where ``MUJOCO_GL`` asks for something special; at worst without pictures."""
+def import_without_gl() -> ModuleType:
+    """Imports MuJoCo; where its GL library cannot be loaded, without pictures (``MUJOCO_GL=off``).
+
+    Returns:
+        the module ``mujoco``.
+
+    Raises:
+        ModuleNotFoundError: MuJoCo is not installed.
+    """
     wanted = os.environ.get("MUJOCO_GL")
-    if wanted is None or "mujoco" in sys.modules or importlib.util.find_spec("mujoco") is None:
-        return
     try:
-        importlib.import_module("mujoco")
-    except (AttributeError, ImportError, OSError, RuntimeError):  # PyOpenGL trips over a None without its library
+        return importlib.import_module("mujoco")
+    except (AttributeError, ImportError, OSError, RuntimeError):  # PyOpenGL reads an attribute of None without a library
         os.environ["MUJOCO_GL"] = "off"
         try:
-            importlib.import_module("mujoco")
+            return importlib.import_module("mujoco")
         finally:
-            os.environ["MUJOCO_GL"] = wanted
+            os.environ.pop("MUJOCO_GL") if wanted is None else os.environ.update(MUJOCO_GL=wanted)
 
 
-load()
+if os.environ.get("MUJOCO_GL") is not None and "mujoco" not in sys.modules and importlib.util.find_spec("mujoco"):
+    import_without_gl()

@@ -1,4 +1,4 @@
-"""What our formats of a trained model share: two files that are replaced as one, and checks before memory is taken."""
+"""Shared by the formats of trained models: atomic replacement of two files, and checks before memory is allocated."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _STAGED = ".next"
 
 
 def require_safetensors() -> ModuleType:
-    """The package by which models and policies are saved, looked for before there is something to lose.
+    """Imports safetensors, which saves models and policies; called before training starts.
 
     Raises:
-        ImportError: it is not installed.
+        ImportError: safetensors is not installed.
     """
     try:
         import safetensors.torch
@@ -38,17 +38,18 @@ def require_safetensors() -> ModuleType:
 def save_model(
     folder: Path, weights: str, state: Mapping[str, torch.Tensor], config: str, content: Mapping[str, Any]
 ) -> None:
-    """Writes a state in float32 as safetensors, and its configuration with the checksum of that file, by :func:`replace_files`.
+    """Writes a state in float32 as safetensors, and its configuration with the checksum of that file.
 
     Args:
-        folder: made if missing.
-        weights, config: names of the two files.
-        state: tensors by name.
-        content: of the configuration, without the checksum.
+        folder (Path): created if missing.
+        weights (str): name of the file of weights.
+        state (mapping of str to Tensor): tensors by name.
+        config (str): name of the configuration.
+        content (mapping): the configuration, without the checksum.
 
     Raises:
         ImportError: safetensors is not installed.
-        TypeError, ValueError: the configuration has values other than those of JSON.
+        TypeError, ValueError: the configuration has values that JSON does not have.
         OSError: the files cannot be written; the old ones stay as they are.
     """
     data = require_safetensors().torch.save(as_float32(state), metadata={"format": "pt"})
@@ -57,22 +58,23 @@ def save_model(
 
 
 def replace_files(folder: Path, weights: tuple[str, bytes], config: tuple[str, str]) -> None:
-    """Writes a file of weights and the configuration beside it, as one: at any instant the old or the new model is there.
+    """Replaces a file of weights and its configuration atomically: at any instant either the old or the new model exists.
 
-    Both are written under other names first. The weights take their name, which is when the new model replaces the old
-    one, and then the configuration takes its own. Its other name bears the checksum of the weights: after a kill between
-    the two, :func:`config_file` finds it.
+    Both are first written under temporary names. Renaming the weights replaces the old model by the new one; the
+    configuration is renamed afterwards. Its temporary name contains the checksum of the weights, by which
+    :func:`config_file` finds it if the process is killed between the two.
 
     Args:
-        folder: made if missing.
-        weights, config: name and content of each.
+        folder (Path): created if missing.
+        weights (tuple of str and bytes): name and content of the file of weights.
+        config (tuple of str and str): name and content of the configuration.
 
     Raises:
-        OSError: they cannot be written; the old files stay as they are.
+        OSError: a file cannot be written; the old files stay as they are.
     """
     folder.mkdir(parents=True, exist_ok=True)
     current = config_file(folder / weights[0], folder / config[0])
-    if current.name != config[0]:  # a save was killed between its two steps
+    if current.name != config[0]:  # a save was killed between the two renames
         os.replace(current, folder / config[0])
     _sweep(folder, weights[0], config[0])
     digest = hashlib.sha256(weights[1]).hexdigest()
@@ -89,7 +91,7 @@ def replace_files(folder: Path, weights: tuple[str, bytes], config: tuple[str, s
 
 
 def config_file(weights: Path, config: Path) -> Path:
-    """The configuration that belongs to a file of weights: ``config``, or one that a killed save left under another name."""
+    """The configuration of a file of weights: ``config``, or the one that a killed save left under its temporary name."""
     if not any(config.parent.glob(f"{config.name}.*{_STAGED}")) or not weights.is_file():
         return config
     staged = _staged_config(config, _digest(weights))
@@ -101,7 +103,7 @@ def _staged_config(config: Path, digest: str) -> Path:
 
 
 def _sweep(folder: Path, *names: str) -> None:
-    """Removes what a killed save left."""
+    """Removes temporary files of killed saves."""
     for name in names:
         for pattern in (f"{name}{_STAGED}", f"{name}.*{_STAGED}", f"{name}.*.part"):
             for path in folder.glob(pattern):
@@ -118,15 +120,16 @@ def _digest(file: Path) -> str:
 
 
 def read_config(file: Path, kind: str, version: int, *, instead: str) -> dict[str, Any]:
-    """The content of one of our JSON files.
+    """Reads one of the package's JSON files.
 
     Args:
-        file: to be read.
-        kind, version: what its fields ``format`` and ``version`` must say.
-        instead: what to do about a file of another format.
+        file (Path): the file.
+        kind (str): expected value of its field ``format``.
+        version (int): expected value of its field ``version``.
+        instead (str): advice in the error for a file of another format.
 
     Raises:
-        ValueError: it is not JSON, or of another format or version.
+        ValueError: it is not JSON, or has another format or version.
     """
     try:
         content = read_json(file)
@@ -142,10 +145,10 @@ def read_config(file: Path, kind: str, version: int, *, instead: str) -> dict[st
 
 
 def read_shapes(file: Path) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a safetensors file, from its header alone.
+    """Reads names and shapes of a safetensors file from its header.
 
     Raises:
-        ValueError: it is damaged.
+        ValueError: the file is damaged.
     """
     require_regular_file(file)
     from safetensors import safe_open, SafetensorError
@@ -158,14 +161,14 @@ def read_shapes(file: Path) -> dict[str, tuple[int, ...]]:
 
 
 def read_tensors(file: Path, digest: Any = None) -> dict[str, torch.Tensor]:
-    """The tensors of a safetensors file, all finite.
+    """Reads the tensors of a safetensors file.
 
     Args:
-        file: to be read.
-        digest: the SHA-256 that it must have; None: any, in folders of earlier releases.
+        file (Path): the file.
+        digest (str, optional): expected SHA-256. Default: None, not checked, for folders of earlier releases.
 
     Raises:
-        ValueError: it is damaged, has another checksum, or holds a number that no trained network has.
+        ValueError: the file is damaged, has another checksum, or contains values that :func:`check_numbers` refuses.
     """
     safetensors = require_safetensors()
     if digest is not None and digest != _digest(file):
@@ -179,11 +182,11 @@ def read_tensors(file: Path, digest: Any = None) -> dict[str, torch.Tensor]:
 
 
 def check_sizes(sizes: Mapping[str, Any], num_tensors: int) -> None:
-    """Refuses a description that asks for more than the weights beside it can be, before anything is built from it.
+    """Checks sizes of networks against the file of weights, before networks of these sizes are built.
 
     Args:
-        sizes: arguments of networks, nested; names that end in ``dropout`` are rates.
-        num_tensors: in the file of weights. No network has more layers.
+        sizes (mapping): arguments of networks, nested; names that end in ``dropout`` are rates.
+        num_tensors (int): number of tensors in the file of weights; no network has more layers.
 
     Raises:
         ValueError: a value out of range or of another type.
@@ -216,11 +219,11 @@ def check_sizes(sizes: Mapping[str, Any], num_tensors: int) -> None:
 
 
 def check_shapes(wanted: Mapping[str, torch.Tensor], found: Mapping[str, tuple[int, ...]]) -> None:
-    """Compares what networks need with what a file has.
+    """Compares the state of networks with the tensors of a file.
 
     Args:
-        wanted: state of the networks, on the meta device say.
-        found: shapes by name.
+        wanted (mapping of str to Tensor): state of the networks; may be on the meta device.
+        found (mapping of str to tuple): shapes in the file by name.
 
     Raises:
         ValueError: tensors are missing, left over or of another shape.
@@ -235,10 +238,10 @@ def check_shapes(wanted: Mapping[str, torch.Tensor], found: Mapping[str, tuple[i
 
 
 def check_kinds(wanted: Mapping[str, torch.Tensor], tensors: Mapping[str, torch.Tensor]) -> None:
-    """Refuses tensors that would be cast on loading: counts in place of weights, or complex numbers.
+    """Checks that loading does not cast integers or complex numbers to weights.
 
     Raises:
-        ValueError: there is one.
+        ValueError: a tensor of another kind.
     """
     for name, value in wanted.items():
         if value.is_floating_point() != tensors[name].is_floating_point() or tensors[name].is_complex():
@@ -246,14 +249,14 @@ def check_kinds(wanted: Mapping[str, torch.Tensor], tensors: Mapping[str, torch.
 
 
 def check_numbers(tensors: Mapping[str, torch.Tensor], where: Path | str) -> None:
-    """Refuses numbers that no trained network has.
+    """Checks that tensors hold values that a trained network can have.
 
     Args:
-        tensors: by name; those that end in ``running_var`` are variances, those that end in ``_std`` are deviations.
-        where: they come from, for the error.
+        tensors (mapping of str to Tensor): by name; ``*running_var`` are variances, ``*_std`` standard deviations.
+        where (Path or str): their origin, for the error.
 
     Raises:
-        ValueError: a NaN or an infinity, a negative variance, or a deviation that is not positive.
+        ValueError: a NaN or an infinity, a negative variance, or a standard deviation that is not positive.
     """
     for name, value in tensors.items():
         if not value.is_floating_point():
@@ -267,12 +270,12 @@ def check_numbers(tensors: Mapping[str, torch.Tensor], where: Path | str) -> Non
 
 
 def state_of(parts: Mapping[str, nn.Module]) -> dict[str, torch.Tensor]:
-    """The states of several networks as one, each tensor's name after its network's."""
+    """Merges the states of several networks; each name is prefixed by that of its network."""
     return {f"{part}.{name}": value for part, module in parts.items() for name, value in module.state_dict().items()}
 
 
 def checksum_of(state: Mapping[str, torch.Tensor]) -> str:
-    """SHA-256 of a state's names and float32 values, as hexadecimal digits; of any device."""
+    """SHA-256 of a state's names and float32 values, as hexadecimal digits; the same on every device."""
     digest = hashlib.sha256()
     for name in sorted(state):
         digest.update(name.encode())
@@ -281,7 +284,7 @@ def checksum_of(state: Mapping[str, torch.Tensor]) -> str:
 
 
 def as_float32(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Copies on the CPU, contiguous, floating numbers in float32."""
+    """Contiguous copies on the CPU, floating tensors in float32."""
     return {
         name: (value.float() if value.is_floating_point() else value).detach().cpu().contiguous()
         for name, value in tensors.items()
@@ -289,9 +292,9 @@ def as_float32(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 
 def json_text(content: Mapping[str, Any]) -> str:
-    """A configuration as it is written.
+    """A configuration as JSON text.
 
     Raises:
-        TypeError, ValueError: values other than those of JSON.
+        TypeError, ValueError: values that JSON does not have.
     """
     return json.dumps(content, indent=2) + "\n"

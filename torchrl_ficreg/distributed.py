@@ -1,4 +1,19 @@
-"""Distributed training: rank, world size, process group, collectives with gradients."""
+"""Training on several processes: rank and world size, the process group, and collectives, two of them with gradients.
+
+One process is the default everywhere: without a process group the rank is 0, the world size 1, and every collective returns
+its argument. With one, all ranks must call a collective at the same point, as ``torch.distributed`` asks.
+
+================================  ===============================================  ==========
+function                          result on every rank                             gradient
+================================  ===============================================  ==========
+:func:`all_reduce_sum`            sum of a tensor                                  yes
+:func:`all_gather`                tensors concatenated along the batch dimension   yes
+:func:`all_reduce_mean`           means of a mapping of tensors, for logging       no
+:func:`any_rank`                  whether a flag is set on some rank
+:func:`broadcast_from_rank0`      any object of rank 0
+:func:`barrier`                   nothing; waits for the other ranks
+================================  ===============================================  ==========
+"""
 
 from __future__ import annotations
 
@@ -12,77 +27,80 @@ import torch
 import torch.distributed as dist
 
 
-# A rank may wait this long while another one records data or evaluates. A rank that has died is noticed by torchrun.
-PATIENCE = timedelta(hours=6)
-
-
-def launched() -> bool:
-    """Whether ``torchrun`` started this process together with others."""
-    return dist.is_available() and dist.is_torchelastic_launched() and int(os.environ["WORLD_SIZE"]) > 1
-
-
-def together() -> bool:
-    """Whether this process is one of several that have met."""
-    return num_processes() > 1
+# Of collectives: the other ranks wait while rank 0 records data or evaluates. torchrun notices a rank that ended.
+TIMEOUT = timedelta(hours=6)
 
 
 def rank() -> int:
-    """Number of this process, from 0; before the processes have met and after they parted, as ``torchrun`` has it.
+    """Rank of this process; outside of :func:`process_group` the one that ``torchrun`` assigned, or 0.
 
     Examples:
         >>> rank(), world_size(), is_main()
         (0, 1, True)
     """
-    if together():
+    if world_size() > 1:
         return dist.get_rank()
-    return int(os.environ["RANK"]) if launched() else 0
+    return int(os.environ["RANK"]) if torchrun_world_size() > 1 else 0
 
 
 def world_size() -> int:
-    """Number of processes that have met; 1 for a process on its own."""
-    return num_processes()
+    """Number of processes in the process group; 1 without one.
+
+    Examples:
+        >>> world_size()
+        1
+    """
+    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
+
+
+def torchrun_world_size() -> int:
+    """Number of processes that ``torchrun`` started, whether or not they have a process group yet; 1 without it.
+
+    Examples:
+        >>> torchrun_world_size()
+        1
+    """
+    return int(os.environ["WORLD_SIZE"]) if dist.is_available() and dist.is_torchelastic_launched() else 1
 
 
 def is_main() -> bool:
-    """Whether this process is the one that writes files and speaks to the user."""
+    """Whether this process has rank 0, which alone writes files and prints."""
     return rank() == 0
 
 
 @contextmanager
 def process_group(device: torch.device) -> Iterator[torch.device]:
-    """Meets the other processes that ``torchrun`` started, and parts from them at the end; nothing without them.
+    """Initialises the process group of the processes that ``torchrun`` started, and destroys it at the end.
 
-    NCCL on CUDA, where every process takes a device of its own; gloo elsewhere.
+    The backend is NCCL on CUDA, with one device for each process, and gloo elsewhere. Without ``torchrun`` nothing happens.
 
-    A process that fails inside leaves without a word: ``torchrun`` sees it end and stops the others, and those that
-    wait for its numbers fail by themselves as soon as its connections close.
+    After an error the process ends without waiting for the others: ``torchrun`` then stops them, and their pending
+    collectives fail as soon as the connections close.
 
     Args:
-        device: what the configuration asks for.
+        device (torch.device): type of the device to train on.
 
     Yields:
-        the device of this process.
+        torch.device: the device of this process.
 
     Raises:
-        ValueError: fewer CUDA devices than processes.
-        RuntimeError: another process failed.
+        ValueError: fewer CUDA devices than processes on this machine.
+        RuntimeError: another rank failed.
     """
-    if not launched():
+    if torchrun_world_size() == 1:
         yield device
         return
     if device.type == "cuda":
         device = _own_device(int(os.environ["LOCAL_RANK"]), torch.cuda.device_count())
         torch.cuda.set_device(device)
     on_cuda = device.type == "cuda"
-    dist.init_process_group(
-        "nccl" if on_cuda else "gloo", timeout=PATIENCE, device_id=device if on_cuda else None
-    )
+    dist.init_process_group("nccl" if on_cuda else "gloo", timeout=TIMEOUT, device_id=device if on_cuda else None)
     try:
         yield device
         dist.barrier()
     except RuntimeError as error:
         if isinstance(error, dist.DistError) or "gloo" in str(error):
-            raise RuntimeError(f"process {rank()} lost another one, which says above or below what failed.") from error
+            raise RuntimeError(f"rank {rank()} lost the connection to another rank: see the error of that rank.") from error
         raise
     dist.destroy_process_group()
 
@@ -96,88 +114,23 @@ def _own_device(local_rank: int, devices: int) -> torch.device:
     return torch.device("cuda", local_rank)
 
 
-def average(values: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Means over all processes of numbers that each has found on its share of a batch, detached.
-
-    All processes must ask at the same moment, for the same keys. A process on its own gets what it gave.
+def all_reduce_sum(value: torch.Tensor) -> torch.Tensor:
+    """Sum of a tensor over all ranks; differentiable.
 
     Args:
-        values: tensors of any shape, floating, on one device.
-
-    Examples:
-        >>> average({"loss": torch.tensor(2.0, requires_grad=True)})
-        {'loss': tensor(2.)}
-    """
-    values = {key: value.detach() for key, value in values.items()}
-    if not together():
-        return values
-    flat = torch.cat([value.float().reshape(-1) for value in values.values()]) / world_size()
-    dist.all_reduce(flat)
-    parts = flat.split([value.numel() for value in values.values()])
-    return {key: part.view(value.shape) for (key, value), part in zip(values.items(), parts, strict=True)}
-
-
-def any_process(flag: bool, device: torch.device | str = "cpu") -> bool:
-    """Whether the flag is up on some process. All must ask at the same moment.
-
-    Examples:
-        >>> any_process(True), any_process(False)
-        (True, False)
-    """
-    if not together():
-        return flag
-    raised = torch.tensor(int(flag), device=device)
-    dist.all_reduce(raised, dist.ReduceOp.MAX)
-    return bool(raised)
-
-
-def wait_for_all() -> None:
-    """Returns when every process has come here."""
-    if together():
-        dist.barrier()
-
-
-def from_main(value: Any) -> Any:
-    """The main process's value, on every process. All must ask at the same moment.
-
-    Examples:
-        >>> from_main("run")
-        'run'
-    """
-    if not together():
-        return value
-    box = [value]
-    dist.broadcast_object_list(box, src=0)
-    return box[0]
-
-
-def num_processes() -> int:
-    """Number of processes that have met; 1 for a process on its own.
-
-    Examples:
-        >>> num_processes()
-        1
-    """
-    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
-
-
-def sum_over_processes(value: torch.Tensor) -> torch.Tensor:
-    """Sum of the values of all processes, on each of them; differentiable. All must ask at the same moment.
-
-    Args:
-        value: [...], of the same shape on every process; not of type bool.
+        value (torch.Tensor): [...], of the same shape on every rank; not of type bool.
 
     Returns:
-        [...].
+        torch.Tensor: [...].
 
     Examples:
-        >>> sum_over_processes(torch.tensor([1.0, 2.0]))
+        >>> all_reduce_sum(torch.tensor([1.0, 2.0]))
         tensor([1., 2.])
     """
-    return value if num_processes() == 1 else _all_reduce(value)
+    return value if world_size() == 1 else _all_reduce(value)
 
 
-# An operator of its own, which torch.compile takes as it is.
+# A custom operator, which torch.compile does not trace into.
 @torch.library.custom_op("torchrl_ficreg::all_reduce", mutates_args=())
 def _all_reduce(value: torch.Tensor) -> torch.Tensor:
     total = value.clone(memory_format=torch.contiguous_format)
@@ -193,29 +146,92 @@ def _(value):
 _all_reduce.register_autograd(lambda ctx, grad: _all_reduce(grad))
 
 
-def gather_clips(value: torch.Tensor, dim: int = 0) -> torch.Tensor:
-    """Joins the shares of all processes along the batch dimension, in their order; differentiable.
+def all_gather(value: torch.Tensor, dim: int = 0) -> torch.Tensor:
+    """Concatenates the batches of all ranks, in the order of ranks; differentiable.
 
-    Meant for a loss that every process then computes on the global batch. The gradient follows the convention of
-    distributed data parallel training: averaged over processes, parameter gradients are those of one process on the
-    whole batch. All processes must ask at the same moment. A process on its own gets what it gave.
+    For a loss that every rank computes on the global batch. The gradient follows the convention of distributed data
+    parallel training: averaged over ranks, parameter gradients are those of one process on the global batch.
 
     Args:
-        value: [..., B, ...], of the same shape on every process; bool has no gradient, but may be gathered.
-        dim: of the batch.
+        value (torch.Tensor): [..., B, ...], of the same shape on every rank. A bool tensor has no gradient.
+        dim (int, optional): the batch dimension. Default: ``0``.
 
     Returns:
-        [..., B * number of processes, ...].
+        torch.Tensor: [..., B * world size, ...].
 
     Examples:
-        >>> gather_clips(torch.zeros(3, 8, 5), dim=1).shape
+        >>> all_gather(torch.zeros(3, 8, 5), dim=1).shape
         torch.Size([3, 8, 5])
     """
-    processes = num_processes()
-    if processes == 1:
+    ranks = world_size()
+    if ranks == 1:
         return value
     rows = (value.byte() if value.dtype == torch.bool else value).movedim(dim, 0)  # [B, ...]
-    before, after = dist.get_rank() * len(rows), (processes - 1 - dist.get_rank()) * len(rows)
-    # Each process writes its rows into zeros: x + 0 is x to the last bit, and the sum knows its gradient already.
+    before, after = dist.get_rank() * len(rows), (ranks - 1 - dist.get_rank()) * len(rows)
+    # A sum of rows padded with zeros: x + 0 is exact, and the sum is differentiable already.
     padded = torch.cat([rows.new_zeros(before, *rows.shape[1:]), rows, rows.new_zeros(after, *rows.shape[1:])])
-    return sum_over_processes(padded).to(value.dtype).movedim(0, dim)
+    return all_reduce_sum(padded).to(value.dtype).movedim(0, dim)
+
+
+def all_reduce_mean(values: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Means over all ranks, detached, in one collective.
+
+    Args:
+        values (Mapping[str, torch.Tensor]): floating tensors of any shape on one device, with the same keys and shapes on
+            every rank.
+
+    Returns:
+        dict[str, torch.Tensor]: float32 on several ranks.
+
+    Examples:
+        >>> all_reduce_mean({"loss": torch.tensor(2.0, requires_grad=True)})
+        {'loss': tensor(2.)}
+    """
+    values = {key: value.detach() for key, value in values.items()}
+    if world_size() == 1:
+        return values
+    flat = torch.cat([value.float().reshape(-1) for value in values.values()]) / world_size()
+    dist.all_reduce(flat)
+    chunks = flat.split([value.numel() for value in values.values()])
+    return {key: chunk.view(value.shape) for (key, value), chunk in zip(values.items(), chunks, strict=True)}
+
+
+def any_rank(flag: bool, device: torch.device | str = "cpu") -> bool:
+    """Whether a flag is set on at least one rank.
+
+    Args:
+        flag (bool): of this rank.
+        device (torch.device or str, optional): one that the backend communicates on. Default: ``"cpu"``.
+
+    Examples:
+        >>> any_rank(True), any_rank(False)
+        (True, False)
+    """
+    if world_size() == 1:
+        return flag
+    raised = torch.tensor(int(flag), device=device)
+    dist.all_reduce(raised, dist.ReduceOp.MAX)
+    return bool(raised)
+
+
+def broadcast_from_rank0(value: Any) -> Any:
+    """The object of rank 0, on every rank.
+
+    Args:
+        value (Any): anything that can be pickled; ignored on the other ranks.
+
+    Examples:
+        >>> broadcast_from_rank0("run")
+        'run'
+    """
+    if world_size() == 1:
+        return value
+    objects = [value]
+    dist.broadcast_object_list(objects, src=0)
+    return objects[0]
+
+
+def barrier() -> None:
+    """Waits until every rank has called it."""
+    if world_size() > 1:
+        dist.barrier()

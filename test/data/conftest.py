@@ -38,9 +38,9 @@ def meta() -> dict:
 def record(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """``record(lengths, target)`` writes one episode per length and returns a new directory."""
 
-    def record(lengths: list[int], target: int | None = None) -> Path:
+    def record(lengths: list[int], target: int | None = None, frames: str = "raw") -> Path:
         path = tmp_path_factory.mktemp("recorded")
-        with EpisodeWriter(path, target_episodes=target or len(lengths), meta=META) as writer:
+        with EpisodeWriter(path, target_episodes=target or len(lengths), meta=META, frames=frames) as writer:
             for number, length in enumerate(lengths, start=1):
                 writer.append(_episode(number, length))
         return path

@@ -71,7 +71,3 @@ def test_mistakes_are_refused():
         ActionStatistics(torch.zeros(2), torch.ones(3))
     with pytest.raises(ValueError, match="multiple of 2"):
         ActionStatistics(torch.zeros(2), torch.ones(2)).normalize(torch.zeros(4, 5))
-
-
-if __name__ == "__main__":
-    pytest.main([__file__])

@@ -57,11 +57,8 @@ def test_every_legal_start_is_a_clip(store):
     legal = {(e, s) for e, length in enumerate(LENGTHS, 1) for s in range(length - 3 * 5)}
     assert got == legal and len(clips) == len(legal)
     assert clips.num_short_episodes == 2  # 15 and 2 rows
-
-
-def test_only_the_given_episodes_are_cut(store):
-    clips = ClipStorage(store, [2, 6], num_frames=4, frame_skip=5, keys=("episode",))
-    assert set(clips[:]["episode"].flatten().tolist()) == {2, 6} and len(clips) == 1 + 25
+    some = ClipStorage(store, [2, 6], num_frames=4, frame_skip=5, keys=("episode",))
+    assert set(some[:]["episode"].flatten().tolist()) == {2, 6} and len(some) == 1 + 25
 
 
 def test_masked_blocks_are_zero_after_z_scoring(store):
@@ -130,11 +127,7 @@ def test_an_epoch_visits_each_clip_once(count, batch_size, drop_last):
         assert all(len(batch) == batch_size for batch in batches[:-1])
         orders.append(order)
     assert orders[0] != orders[1] != orders[2]
-
-
-def test_clips_left_out_of_one_epoch_are_not_left_out_of_all():
-    buffer = numbers(7, 5, drop_last=True)
-    assert {number for _ in range(10) for number in buffer.sample().tolist()} == set(range(7))
+    assert len(set(sum(orders, []))) == count  # what one epoch leaves out, another one serves
 
 
 def test_first_batches_are_uniform_over_clips():
@@ -206,7 +199,3 @@ def test_sampler_and_storage_serve_a_plain_torchrl_buffer(store):
     batch = buffer.sample()
     assert batch.shape == (6, 4)
     assert (clips[batch["index"][:, 0]] == batch.exclude("index")).all()
-
-
-if __name__ == "__main__":
-    pytest.main([__file__])

@@ -5,9 +5,9 @@
     are the same, whatever the number of threads.
 3.  Datasets of before frames had a format are read, and continued, as raw.
 4.  Each kind of damage of the two files is reported; what is left whole still reads.
-5.  Stores travel to other processes as a path, forked and spawned ones, even after threads have run.
-6.  A returned batch belongs to the caller: writing into it reaches neither the file nor another batch, and its memory
-    is used again only when nobody can see it any more.
+5.  Stores are pickled as a path, and forked processes read them, even after threads have run.
+6.  A returned batch belongs to the caller: writing into it reaches neither the file nor another batch, and its buffer
+    is used again only after the last reference to it is gone.
 7.  Without Pillow, raw frames work and the error for the others says what to install.
 """
 
@@ -25,12 +25,12 @@ import torch
 
 from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, estimate_bytes, OfflineTrajectories
 from torchrl_ficreg.data.frames import (
+    BufferPool,
     check_frame_format,
     default_threads,
     encode_frames,
     ImageFrames,
     RawFrames,
-    Recycler,
     run_split,
 )
 
@@ -106,6 +106,9 @@ def test_raw_frames_are_gathered_as_by_indexing(num_threads):
     for row in (-1, 40):
         with pytest.raises(IndexError, match="rows run from 0 to 39"):
             reader.read(np.array([row]))
+    for rows in (np.array([True, False]), np.array([0.0, 1.0])):
+        with pytest.raises(TypeError, match="rows are picked by integers"):
+            reader.read(rows)
 
 
 @needs_pillow
@@ -126,6 +129,8 @@ def test_only_the_files_differ(write, frames):
         "pixels.blob",
         "pixels.offsets",
     }
+    header = json.loads((path / "meta.json").read_text())
+    assert header["version"] == 2 and header["frames"] == frames  # code that reads version 1 only refuses it
     with pytest.raises(ValueError, match="num_threads must be at least 1, got 0"):
         EpisodeStore.open(path, num_threads=0)
 
@@ -182,13 +187,6 @@ def test_datasets_of_before_frames_had_a_format_are_raw(write):
     with EpisodeWriter(path, target_episodes=4, meta=META) as writer:
         writer.append(episodes[0])
     assert EpisodeStore.open(path, verify="full").num_episodes == 4
-
-
-@needs_pillow
-def test_code_of_before_refuses_compressed_datasets(write):
-    """It compares the version with 1 and would otherwise take the files for lost."""
-    header = json.loads((write("png")[0] / "meta.json").read_text())
-    assert header["version"] == 2 and header["frames"] == "png"
 
 
 @needs_pillow
@@ -258,10 +256,7 @@ def test_every_cut_of_the_files_opens_or_is_refused(write):
             for file, data in whole.items():
                 (path / file).write_bytes(data)
             (path / "episodes.jsonl").write_bytes(b"".join(lines[:2]))  # the line comes last
-            if name == "episodes.jsonl":
-                (path / name).write_bytes(whole[name][:cut])
-            else:
-                (path / name).write_bytes(whole[name][:cut])
+            (path / name).write_bytes(whole[name][:cut])
             store = EpisodeStore.open(path, allow_incomplete=True, verify="full")
             done = 3 if name == "episodes.jsonl" and cut == len(whole[name]) else 2
             assert store.num_episodes == done
@@ -271,7 +266,7 @@ def test_every_cut_of_the_files_opens_or_is_refused(write):
             assert {file.name: file.read_bytes() for file in path.iterdir()} == whole
 
 
-def test_stores_travel_as_a_path(write):
+def test_stores_travel_as_a_path(write, make_episode):
     for frames in ("raw", "webp") if "PIL" in sys.modules else ("raw",):
         path, _ = write(frames, size=(32, 32))
         store = EpisodeStore.open(path, num_threads=2)
@@ -280,20 +275,18 @@ def test_stores_travel_as_a_path(write):
         arrived = pickle.loads(data)
         assert arrived.num_threads == 2
         rows = np.arange(0, 76, 5)
-        expected = store.frames(rows)
-        np.testing.assert_array_equal(arrived.frames(rows), expected)
-        in_memory = EpisodeStore.from_episodes([{**_zeros(5)}])
-        np.testing.assert_array_equal(pickle.loads(pickle.dumps(in_memory)).frames(slice(None)), _zeros(5)["pixels"])
+        np.testing.assert_array_equal(arrived.frames(rows), store.frames(rows))
+        np.testing.assert_array_equal(arrived.arrays["state"], store.arrays["state"])
+    in_memory = EpisodeStore.from_episodes([make_episode(1)])
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(in_memory)).frames(slice(None)), make_episode(1)["pixels"])
 
 
 @needs_pillow
-@pytest.mark.parametrize("method", ["fork", "spawn"])
-def test_other_processes_read_the_same_frames(write, method):
+def test_a_forked_process_reads_the_same_frames(write):
     store = EpisodeStore.open(write("webp")[0], num_threads=3)
     rows = np.arange(60)
     expected = store.frames(rows)  # the threads now run in this process, and do not in a forked one
-    context = multiprocessing.get_context(method)
-    with context.Pool(1) as pool:
+    with multiprocessing.get_context("fork").Pool(1) as pool:
         np.testing.assert_array_equal(pool.apply_async(_read, (store, rows)).get(timeout=300), expected)
 
 
@@ -330,44 +323,40 @@ KEEP_ALIVE = {
 
 
 @pytest.mark.parametrize("how", KEEP_ALIVE)
-def test_memory_waits_for_its_last_user(how):
-    recycler = Recycler(keep=1, smallest=1)
-    array = recycler.empty((4, 8))
-    address = array.ctypes.data
-    user = KEEP_ALIVE[how](array)
-    del array
-    assert recycler.empty((4, 8)).ctypes.data != address
-    recycler = Recycler(keep=1, smallest=1)
-    array = recycler.empty((4, 8))
-    address = array.ctypes.data
-    user = KEEP_ALIVE[how](array)
-    del array, user
-    assert recycler.empty((4, 8)).ctypes.data == address
+def test_a_buffer_waits_for_its_last_user(how):
+    for released in (False, True):
+        pool = BufferPool(keep=1, smallest=1)
+        array = pool.empty((4, 8))
+        address, users = array.ctypes.data, [KEEP_ALIVE[how](array)]
+        del array
+        if released:
+            users.clear()
+        assert (pool.empty((4, 8)).ctypes.data == address) == released
 
 
-def test_a_recycler_keeps_little():
-    recycler = Recycler(keep=2, smallest=8)
-    arrays = [recycler.empty((8,)) for _ in range(5)]
+def test_a_pool_keeps_few_buffers():
+    pool = BufferPool(keep=2, smallest=8)
+    arrays = [pool.empty((8,)) for _ in range(5)]
     addresses = [array.ctypes.data for array in arrays]
     assert len(set(addresses)) == 5
     del arrays
-    assert len(recycler._shelf) == 2
-    recycler.empty((16,))  # another batch size: the old blocks go
-    assert [memory.size for memory in recycler._shelf] == [16]
-    assert recycler.empty((4,)).size == 4 and [memory.size for memory in recycler._shelf] == [16]
+    assert len(pool._free) == 2
+    pool.empty((16,))  # another batch size: the old blocks go
+    assert [memory.size for memory in pool._free] == [16]
+    assert pool.empty((4,)).size == 4 and [memory.size for memory in pool._free] == [16]
 
 
-def test_threads_never_share_recycled_memory():
-    recycler = Recycler(smallest=1)
+def test_threads_never_share_a_buffer():
+    pool = BufferPool(smallest=1)
 
     def hold(number):
         for _ in range(300):
-            array = recycler.empty((64,))
+            array = pool.empty((64,))
             array[:] = number
             assert (array[::-1] == number).all()
 
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(hold, range(8)))
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(hold, range(8)))
 
 
 @pytest.mark.parametrize("num_threads", [1, 2, 7])
@@ -401,7 +390,7 @@ def test_without_pillow_the_error_names_the_extra(write, monkeypatch):
     with pytest.raises(ImportError, match=r"needs Pillow: pip install 'torchrl_ficreg\[data\]'"):
         EpisodeWriter(path.parent / "new", target_episodes=1, meta=META, frames="webp")
     assert not (path.parent / "new").exists()
-    with pytest.raises(ValueError, match="raw frames are rows of bytes"):
+    with pytest.raises(ValueError, match="raw frames are not encoded"):
         encode_frames(np.zeros((1, 3, 2, 2), np.uint8), "raw")
     check_frame_format("raw")
 
@@ -419,30 +408,12 @@ def test_the_estimate_is_on_the_safe_side_of_our_environments(size, tmp_path):
             writer.append(episode)
         size_on_disk = sum(file.stat().st_size for file in path.iterdir() if file.name not in TEXT)
         estimate = estimate_bytes(length, size, 2, episode["state"].shape[1], frames)
+        assert estimate == estimate_bytes(length, (size, size), 2, episode["state"].shape[1], frames)
         assert (size_on_disk == estimate) if frames == "raw" else (size_on_disk < estimate < length * 3 * size**2 / 2)
 
 
 TEXT = ("meta.json", "episodes.jsonl")
 
 
-def _zeros(length):
-    return {
-        "pixels": np.zeros((length, 3, 4, 4), np.uint8),
-        "action": np.zeros((length, 1), np.float32),
-        "state": np.zeros((length, 1)),
-    }
-
-
 def _read(store, rows):
     return store.frames(rows)
-
-
-if __name__ == "__main__":
-    pytest.main([__file__])
-
-
-@pytest.mark.parametrize("rows", [np.array([True, False]), np.array([0.0, 1.0])])
-def test_rows_that_are_not_integers_are_refused(rows):
-    frames = RawFrames(np.zeros((2, 3, 4, 4), np.uint8))
-    with pytest.raises(TypeError, match="rows are picked by integers"):
-        frames.read(rows)

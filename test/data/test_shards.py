@@ -1,4 +1,4 @@
-"""Shards recorded side by side are the dataset that one writer would have made."""
+"""Claim: shards recorded in parallel are the dataset that one writer would have recorded."""
 
 from __future__ import annotations
 
@@ -63,17 +63,11 @@ def test_their_clips_come_in_the_same_order(sharded, whole):
     assert torch.equal(ours.statistics.mean, theirs.statistics.mean)
 
 
-def test_a_list_of_folders_is_one_dataset_too(sharded, whole):
-    folder = sharded(3)
-    dataset = OfflineTrajectories([folder / f"shard-{n}" for n in range(3)], num_frames=2)
-    assert dataset.fingerprint == OfflineTrajectories(whole, num_frames=2).fingerprint
-
-
 def test_numbered_shards_may_be_listed_in_any_order(sharded, whole):
     folder = sharded(3)
-    ours = open_store([folder / "shard-2", folder / "shard-0", folder / "shard-1"])
+    ours = OfflineTrajectories([folder / "shard-2", folder / "shard-0", folder / "shard-1"], num_frames=2).store
     assert ours.fingerprint == EpisodeStore.open(whole).fingerprint
-    assert "shard" not in ours.header.meta  # what is noted of all is noted of the whole
+    assert "shard" not in ours.header.meta  # only what all shards have in common
 
 
 def test_shards_without_numbers_keep_the_order_of_the_list(sharded):
@@ -109,14 +103,12 @@ def test_other_folders_beside_the_shards_are_left_alone(sharded, whole):
     assert open_store(folder).fingerprint == EpisodeStore.open(whole).fingerprint
 
 
-def test_a_shard_without_an_episode_yet_says_how_many_there_are(sharded, tmp_path):
+def test_the_first_shard_says_how_many_there_are(sharded, record, tmp_path):
+    """Also one without an episode; a dataset that was not recorded as a shard is refused."""
     assert shard_meta(tmp_path) is None
     folder = sharded(3, shards=[1])
     (folder / "shard-1" / "episodes.jsonl").write_bytes(b"")
     assert shard_meta(folder)["shards"] == 3
-
-
-def test_a_shard_that_does_not_say_how_many_there_are_is_refused(record, tmp_path):
     shutil.copytree(record([20]), tmp_path / "other" / "shard-0")
     with pytest.raises(ValueError, match="does not say how many shards"):
         shard_meta(tmp_path / "other")
@@ -127,16 +119,15 @@ def test_more_than_ten_shards_keep_their_order(sharded):
     assert store.length.tolist() == LENGTHS
 
 
-def test_a_frame_slice_within_an_episode_is_not_copied(sharded):
+def test_slices_are_not_copied_rows_are_checked_and_pickles_hold_paths(sharded):
     store = open_store(sharded(3))
     assert not store.frames(slice(22, 30)).flags.owndata
-
-
-def test_it_travels_to_another_process_as_paths(sharded):
-    store = open_store(sharded(3))
+    for row in (-1, store.num_steps):
+        with pytest.raises(IndexError, match="rows run from 0"):
+            store.frames(np.array([row]))
     packed = pickle.dumps(store)
     assert np.array_equal(pickle.loads(packed).frames(np.arange(50)), store.frames(np.arange(50)))
-    assert len(packed) < store.num_steps * 48  # its frames alone are that large
+    assert len(packed) < store.num_steps * 48  # the size of its frames alone
 
 
 def test_a_missing_shard_is_noticed(sharded):
@@ -151,13 +142,6 @@ def test_shards_of_different_settings_are_refused(sharded, record):
         open_store([folder / "shard-0", record([20])])
     with pytest.raises(ValueError, match="at least one directory"):
         open_store([])
-
-
-def test_a_row_outside_is_an_error(sharded):
-    store = open_store(sharded(3))
-    for row in (-1, store.num_steps):
-        with pytest.raises(IndexError, match="rows run from 0"):
-            store.frames(np.array([row]))
 
 
 def test_no_dataset_at_all_says_so(tmp_path):

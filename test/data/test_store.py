@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 
-import numpy as np
 import pytest
 
 from torchrl_ficreg.data import EpisodeStore
@@ -29,14 +27,12 @@ def edit(file, old, new):
 @pytest.mark.parametrize(
     "name, old, new, message",
     [
-        ("episodes.jsonl", b'{"episode": 2', b'{"episode# 2', "line 2 is garbled"),
+        ("episodes.jsonl", b'{"episode": 2', b'{"episode# 2', "line 2 is invalid"),
         ("episodes.jsonl", b'"episode": 2', b'"episode": 3', "line 2 holds episode 3 .* expected episode 2 at row 20"),
         ("episodes.jsonl", b'"start": 20', b'"start": 21', "expected episode 2 at row 20"),
         ("episodes.jsonl", b'"length": 22', b'"length": 99', "damaged: .* bytes, the index needs"),
-        ("episodes.jsonl", b'"length": 20', b'"length": "a"', "line 1 holds"),
         ("meta.json", b'"version": 1', b'"version": 3', "format version 3, this code reads 1 and 2"),
-        ("meta.json", b"{", b"", "is not the header"),
-        ("meta.json", b'"shapes"', b'"shape"', "lacks or garbles the field 'shapes'"),
+        ("meta.json", b'"shapes"', b'"shape"', "has a missing or invalid field 'shapes'"),
     ],
 )
 def test_a_damaged_text_file_is_reported(record, name, old, new, message):
@@ -100,17 +96,6 @@ def test_writes_stay_in_the_process(record):
     assert other.arrays["state"][-1].tolist() == [2, 20]
 
 
-def test_a_pickled_store_carries_its_path_and_not_its_data(record, make_episode):
-    path = record([200, 200])
-    store = EpisodeStore.open(path)
-    data = pickle.dumps(store)
-    assert len(data) < 4000 < store.arrays["pixels"].nbytes
-    arrived = pickle.loads(data)
-    np.testing.assert_array_equal(arrived.arrays["pixels"], store.arrays["pixels"])
-    in_memory = EpisodeStore.from_episodes([make_episode(1)])
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(in_memory)).arrays["state"], in_memory.arrays["state"])
-
-
 def test_a_dataset_larger_than_memory_opens(tmp_path):
     header = Header(1, {"pixels": (3, 224, 224), "action": (1,), "state": (1,)}, {})
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -146,12 +131,11 @@ def test_episodes_in_memory_meet_the_same_checks(make_episode):
         EpisodeStore.from_episodes([{"pixels": make_episode(1)["pixels"]}])
 
 
-def test_the_header_is_plain_json(record):
-    content = json.loads((record([20]) / "meta.json").read_text())
+def test_header_and_index_are_plain_json(record):
+    path = record([20, 30])
+    content = json.loads((path / "meta.json").read_text())
     assert content["shapes"] == {"pixels": [3, 4, 4], "action": [3], "state": [2]}
     assert content["dtypes"] == {"pixels": "|u1", "action": "<f4", "state": "<f8"}
-    assert content["target_episodes"] == 1 and content["meta"]["env"] == "two_room"
-
-
-if __name__ == "__main__":
-    pytest.main([__file__])
+    assert content["target_episodes"] == 2 and content["meta"]["env"] == "two_room"
+    entries = [json.loads(line) for line in (path / "episodes.jsonl").read_text().splitlines()]
+    assert [(entry["episode"], entry["start"], entry["length"]) for entry in entries] == [(1, 0, 20), (2, 20, 30)]

@@ -24,7 +24,7 @@ import time
 import numpy as np
 import pytest
 
-from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, estimate_bytes
+from torchrl_ficreg.data import EpisodeStore, EpisodeWriter
 
 TEXT = {"meta.json", "episodes.jsonl"}
 DATA = {
@@ -111,7 +111,7 @@ def check_prefix(path, make_episode):
 
 
 def test_a_kill_at_any_system_call_loses_at_most_the_current_episode(tmp_path, collect, make_episode, frames):
-    target = 4 if frames == "raw" else 2
+    target = 3 if frames == "raw" else 2
     collect(tmp_path / "unbroken", target)
     unbroken = content(tmp_path / "unbroken")
     survived = []
@@ -142,12 +142,12 @@ def test_a_kill_while_resuming_is_harmless_too(tmp_path, collect, make_episode, 
 
 
 def test_random_kills_never_break_or_duplicate(tmp_path, collect, make_episode):
-    collect(tmp_path / "unbroken", 60)
+    collect(tmp_path / "unbroken", 40)
     path = tmp_path / "killed"
     random = np.random.default_rng(0)
     before = 0
-    for _ in range(8):
-        process = fork.Process(target=collect, args=(path, 60, 0.001))
+    for _ in range(6):
+        process = fork.Process(target=collect, args=(path, 40, 0.001))
         process.start()
         time.sleep(random.uniform(0.01, 0.06))
         os.kill(process.pid, signal.SIGKILL)
@@ -155,7 +155,7 @@ def test_random_kills_never_break_or_duplicate(tmp_path, collect, make_episode):
         episodes = check_prefix(path, make_episode)
         assert episodes >= before
         before = episodes
-    collect(path, 60)
+    collect(path, 40)
     assert content(path) == content(tmp_path / "unbroken")
 
 
@@ -340,18 +340,6 @@ def test_non_contiguous_arrays_are_stored_as_they_read(tmp_path, make_episode, m
     np.testing.assert_array_equal(EpisodeStore.open(tmp_path, verify="full").arrays["pixels"], episode["pixels"])
 
 
-def test_the_size_estimate_is_exact(record):
-    path = record([20, 30])
-    size = sum((path / f"{key}.memmap").stat().st_size for key in ("pixels", "action", "state"))
-    assert estimate_bytes(50, 4, action_dim=3, state_dim=2) == size == estimate_bytes(50, (4, 4), 3, 2)
-
-
-def test_the_index_is_one_plain_json_line_per_episode(record):
-    lines = (record([20, 30]) / "episodes.jsonl").read_text().splitlines()
-    entries = [json.loads(line) for line in lines]
-    assert [(entry["episode"], entry["start"], entry["length"]) for entry in entries] == [(1, 0, 20), (2, 20, 30)]
-
-
 @pytest.mark.parametrize("lost", ["episodes.jsonl", "state.memmap"])
 def test_a_dataset_that_lost_a_file_is_not_cut_to_nothing(tmp_path, make_episode, meta, lost):
     """Without its index a dataset would look empty, and a writer would make it so."""
@@ -407,7 +395,7 @@ def test_links_are_not_written_through(record, meta, tmp_path):
         kept = (path / name).read_bytes()
         (path / name).unlink()
         (path / name).symlink_to(victim)
-        with pytest.raises(ValueError, match="damaged|garbled|a link"):
+        with pytest.raises(ValueError, match="damaged|invalid|a link"):
             EpisodeWriter(path, target_episodes=9, meta=meta)
         assert victim.read_bytes() == bytes(100_000)
         (path / name).unlink()
@@ -429,15 +417,6 @@ def test_a_complete_dataset_is_not_opened_for_writing(record, meta, monkeypatch)
     monkeypatch.setattr(os, "open", refused)
     with EpisodeWriter(path, target_episodes=2, meta=meta) as writer:
         assert writer.complete and writer.num_steps == 40
-
-
-def test_a_complete_dataset_with_a_wrong_shape_is_no_complete_dataset(record, meta):
-    path = record([20, 20], target=2)
-    notes = json.loads((path / "meta.json").read_text())
-    notes["shapes"]["pixels"] = [3, 4, 2]
-    (path / "meta.json").write_text(json.dumps(notes))
-    with pytest.raises(ValueError, match="checksum"):
-        EpisodeWriter(path, target_episodes=2, meta=meta)
 
 
 @pytest.mark.parametrize("frames", ["raw", "png"])
@@ -502,7 +481,3 @@ def test_a_first_episode_cut_by_a_power_failure_is_recorded_again(record, meta, 
         assert writer.num_episodes == 0
         writer.append(make_episode(1))
     assert content(path) == files
-
-
-if __name__ == "__main__":
-    pytest.main([__file__])

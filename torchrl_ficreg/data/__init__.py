@@ -1,4 +1,4 @@
-"""Recording episodes and serving clips of them."""
+"""Recorded episodes on disk, and clips of them for training."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from torchrl.data.datasets import register_dataset
 
 from torchrl_ficreg.data.action_statistics import ActionStatistics
 from torchrl_ficreg.data.clips import clip_length, ClipSampler, ClipStorage
-from torchrl_ficreg.data.dataset import OfflineTrajectories, SeekableReplayBuffer, split_episodes
+from torchrl_ficreg.data.dataset import OfflineTrajectories, split_episodes
 from torchrl_ficreg.data.layout import check_episode, estimate_bytes
+from torchrl_ficreg.data.shards import open_store
 from torchrl_ficreg.data.store import EpisodeStore
 from torchrl_ficreg.data.writer import EpisodeWriter
 
@@ -18,10 +19,10 @@ __all__ = [
     "EpisodeStore",
     "EpisodeWriter",
     "OfflineTrajectories",
-    "SeekableReplayBuffer",
     "check_episode",
     "clip_length",
     "estimate_bytes",
+    "open_store",
     "split_episodes",
 ]
 

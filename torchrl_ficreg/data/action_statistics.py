@@ -7,23 +7,23 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_SMALLEST_STD = 1e-8  # as the LeWM recipe floors it; below it a dimension counts as constant
+_SMALLEST_STD = 1e-8  # the lower bound of the LeWM recipe; below it a dimension counts as constant
 
 
 @dataclass(frozen=True, eq=False)
 class ActionStatistics:
     """Mean and population standard deviation of each raw action dimension.
 
-    Models see z-scored actions, environments see their own units. The statistics come from training episodes
-    only and travel with a model's checkpoint, so that a model can be used without its dataset.
+    Models take z-scored actions, environments take their own units. The statistics come from training episodes only
+    and are stored in a model's checkpoint, so that a model can be used without its dataset.
 
     Both directions accept single actions and action blocks alike: a last axis of size F * A holds F raw
     actions one after another (time-major), each z-scored with the same A numbers.
 
-    Attributes:
-        mean: float32 [A], environment units.
-        std: float32 [A], environment units, positive. Exactly 1 where the action never changes: that dimension
-            carries nothing, is 0 once normalized, and comes back unchanged.
+    Args:
+        mean (Tensor): float32 [A], environment units.
+        std (Tensor): float32 [A], environment units, positive. Exactly 1 where the action never changes: that dimension
+            is 0 once normalized, and denormalized to its constant value.
 
     Raises:
         ValueError: ``mean`` and ``std`` are not two equal [A] vectors, finite, with positive ``std``.
@@ -55,7 +55,7 @@ class ActionStatistics:
         """Measures the statistics, accumulating in float64.
 
         Args:
-            action: [N, A] raw actions, without the rows at which no action was taken.
+            action (Tensor): [N, A] raw actions, without the rows at which no action was taken.
 
         Raises:
             ValueError: not [N, A] with N >= 1, or not finite.
@@ -78,21 +78,35 @@ class ActionStatistics:
 
     @property
     def constant(self) -> Tensor:
-        """Which dimensions never change in the data, bool [A]: a plan keeps them at their mean.
+        """Dimensions that never change in the data, bool [A]: a plan keeps them at their mean.
 
-        They are those of std exactly 1. Where every std is 1 the statistics leave the units alone and were not
-        measured: then no dimension counts as constant.
+        These are the dimensions with a std of exactly 1. Where every std is 1, the statistics were not measured but
+        leave the units as they are: then no dimension counts as constant.
         """
         ones = self.std == 1  # [A]
         return ones & ~ones.all()
 
     def normalize(self, action: Tensor) -> Tensor:
-        """Environment units to z-scores, ``(action - mean) / std``; [..., A] or [..., F * A], same shape out."""
+        """Environment units to z-scores, ``(action - mean) / std``.
+
+        Args:
+            action (Tensor): [..., A], or action blocks [..., F * A].
+
+        Returns:
+            as ``action``.
+        """
         raw = self._split(action)  # [..., F, A]
         return ((raw - self.mean.to(raw)) / self.std.to(raw)).reshape(action.shape)
 
     def denormalize(self, action: Tensor) -> Tensor:
-        """Z-scores to environment units, ``action * std + mean``; [..., A] or [..., F * A], same shape out."""
+        """Z-scores to environment units, ``action * std + mean``.
+
+        Args:
+            action (Tensor): [..., A], or action blocks [..., F * A].
+
+        Returns:
+            as ``action``.
+        """
         raw = self._split(action)  # [..., F, A]
         return (raw * self.std.to(raw) + self.mean.to(raw)).reshape(action.shape)
 

@@ -1,4 +1,4 @@
-"""Clips: strided sub-trajectories, cut out of episodes when they are read."""
+"""Clips, strided sub-trajectories cut out of episodes when they are read, and the order in which they are drawn."""
 
 from __future__ import annotations
 
@@ -15,183 +15,7 @@ from torchrl_ficreg.data.action_statistics import ActionStatistics
 from torchrl_ficreg.data.store import EpisodeStore
 from torchrl_ficreg.keys import ACTION, EPISODE, MASK, PIXELS, STATE, STEP
 
-
-class ClipSampler(SamplerWithoutReplacement):
-    """Draws every clip exactly once per epoch, in an order that depends on nothing but the seed.
-
-    Epoch e visits the clips in the order ``permutation(seed, e)``; batch k of the run is the k-th piece of that
-    endless sequence of epochs. The position is therefore one number, :attr:`batches`, and :meth:`seek` reaches any
-    position at once: a resumed run continues with the very batch it would have drawn. Neither the global random
-    state nor the replay buffer's generator takes part.
-
-    An item is whatever the storage counts; with :class:`~torchrl_ficreg.data.ClipStorage` it is a clip.
-
-    Several processes that train one model share every batch: the sampler of each draws the whole batch and hands out
-    its own piece. Together the pieces are the batch that one process would have drawn, and the position is the same
-    number everywhere, so that a run may be continued on another number of processes.
-
-    Keyword Args:
-        shuffle: ``False`` visits the clips in their stored order, in every epoch.
-        drop_last: leave out the last clips of an epoch when they do not fill a batch. With ``False`` the last
-            batch of an epoch is shorter; several processes then leave out what is not at least two clips for each.
-        seed: not negative.
-        part: (r, n), the r-th of n equal pieces of every batch, r from 0.
-
-    Raises:
-        ValueError: a negative seed or an impossible part; when drawing: fewer clips than one batch, a batch that n
-            processes cannot share equally, or another batch size or number of clips than before, under which the
-            position would mean something else.
-
-    Examples:
-        >>> from torchrl.data import ReplayBuffer, TensorStorage
-        >>> sampler = ClipSampler(seed=3)
-        >>> buffer = ReplayBuffer(storage=TensorStorage(torch.arange(6)), sampler=sampler, batch_size=2)
-        >>> first = [buffer.sample().tolist() for _ in range(3)]
-        >>> sorted(sum(first, []))
-        [0, 1, 2, 3, 4, 5]
-        >>> sampler.seek(1)
-        >>> buffer.sample().tolist() == first[1]
-        True
-    """
-
-    def __init__(
-        self, *, shuffle: bool = True, drop_last: bool = True, seed: int = 0, part: tuple[int, int] = (0, 1)
-    ) -> None:
-        super().__init__(drop_last=drop_last, shuffle=shuffle)
-        if seed < 0:
-            raise ValueError(f"seed must not be negative, got {seed}.")
-        if not 0 <= part[0] < part[1]:
-            raise ValueError(f"part is (r, n) with 0 <= r < n, got {tuple(part)}.")
-        self.seed = int(seed)
-        self.part = (int(part[0]), int(part[1]))
-        self.batches = 0
-        self._batch_size = 0  # 0: nothing drawn yet
-        self._num_clips = 0
-        self._order: tuple[int, np.ndarray] | None = None  # epoch and its permutation
-
-    def sample(self, storage: Storage, batch_size: int) -> tuple[torch.Tensor, dict[str, Any]]:
-        """The next batch of clip numbers, or this process's part of it, int64 [batch_size / n]."""
-        self._bind(len(storage), batch_size)
-        per_epoch = self.batches_per_epoch(len(storage), batch_size)
-        epoch, batch = divmod(self.batches, per_epoch)
-        index = self._epoch_order(epoch)[batch * batch_size : (batch + 1) * batch_size]
-        piece, pieces = self.part
-        share = len(index) // pieces  # of whole batches there is no rest
-        index = index[piece * share : (piece + 1) * share]
-        self.batches += 1
-        left = per_epoch - 1 - batch
-        # TorchRL's iteration and prefetching read these two. `ran_out` goes first, since a prefetching thread
-        # that saw the count of the next epoch before it would run into that epoch.
-        self._ran_out = left == 0
-        self._remaining_batches = left or per_epoch
-        return torch.from_numpy(index.copy()), {}
-
-    def batches_per_epoch(self, num_clips: int, batch_size: int) -> int:
-        """Batches of one epoch over so many clips."""
-        pieces = self.part[1]
-        shared = num_clips - num_clips % pieces
-        if pieces > 1 and shared >= batch_size and shared % batch_size < 2 * pieces:
-            shared -= shared % batch_size  # a statistic of the batch needs two clips on every process
-        return batches_per_epoch(shared, batch_size, self.drop_last)
-
-    def seek(self, batches: int) -> None:
-        """Makes ``batches`` the number of batches drawn so far: the next one is batch number ``batches``.
-
-        Raises:
-            ValueError: a negative number.
-        """
-        if batches < 0:
-            raise ValueError(f"batches must not be negative, got {batches}.")
-        self.batches = int(batches)
-        self._ran_out = False
-        if self._batch_size:
-            per_epoch = self.batches_per_epoch(self._num_clips, self._batch_size)
-            self._remaining_batches = per_epoch - self.batches % per_epoch
-
-    def can_sample(self, storage: Storage, batch_size: int) -> bool:
-        """Whether the storage fills one batch."""
-        return len(storage) >= (batch_size if self.drop_last else self.part[1])
-
-    def state_dict(self) -> dict[str, int]:
-        """Plain numbers. With prefetching, ``batches`` counts those not yet handed out: see ``OfflineTrajectories``."""
-        return {
-            "seed": self.seed,
-            "shuffle": int(self.shuffle),
-            "drop_last": int(self.drop_last),
-            "batches": self.batches,
-            "batch_size": self._batch_size,
-            "num_clips": self._num_clips,
-        }
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continues the saved order, whatever seed this sampler was made with."""
-        self._empty()
-        self.seed = int(state_dict["seed"])
-        self.shuffle, self.drop_last = bool(state_dict["shuffle"]), bool(state_dict["drop_last"])
-        self._batch_size, self._num_clips = int(state_dict["batch_size"]), int(state_dict["num_clips"])
-        self.seek(int(state_dict["batches"]))
-
-    def __repr__(self) -> str:
-        flags = f"shuffle={self.shuffle}, drop_last={self.drop_last}, seed={self.seed}"
-        return f"{type(self).__name__}({flags}, batches={self.batches})"
-
-    def _bind(self, num_clips: int, batch_size: int) -> None:
-        if batch_size % self.part[1]:
-            raise ValueError(
-                f"{self.part[1]} processes cannot share a batch of {batch_size} clips equally: choose a multiple of "
-                f"{self.part[1]}."
-            )
-        if batch_size < 1 or num_clips < (batch_size if self.drop_last else self.part[1]):
-            raise ValueError(
-                f"{num_clips} clips do not fill a batch of {batch_size}: lower batch_size or pass drop_last=False."
-            )
-        if not self._batch_size:
-            self._batch_size, self._num_clips = batch_size, num_clips
-        if (num_clips, batch_size) != (self._num_clips, self._batch_size):
-            raise ValueError(
-                f"the position counts batches of {self._batch_size} out of {self._num_clips} clips, got batches of "
-                f"{batch_size} out of {num_clips}: keep both, or use a new sampler."
-            )
-
-    def _epoch_order(self, epoch: int) -> np.ndarray:
-        if self._order is None or self._order[0] != epoch:
-            clips = np.arange(self._num_clips)
-            if self.shuffle:
-                np.random.default_rng([self.seed, epoch]).shuffle(clips)
-            self._order = (epoch, clips)
-        return self._order[1]
-
-    def _empty(self) -> None:
-        self.batches = self._batch_size = self._num_clips = 0
-        self._order = None
-        self._ran_out = False
-
-    def __getstate__(self) -> dict[str, Any]:
-        # The permutation is as large as the dataset has clips, and can be made again.
-        return {**super().__getstate__(), "_order": None}
-
-
-def batches_per_epoch(num_clips: int, batch_size: int, drop_last: bool) -> int:
-    """Batches that visit every clip once.
-
-    Examples:
-        >>> batches_per_epoch(10, 4, drop_last=True), batches_per_epoch(10, 4, drop_last=False)
-        (2, 3)
-    """
-    return num_clips // batch_size if drop_last else -(num_clips // -batch_size)
-
-
 CLIP_KEYS = (PIXELS, ACTION, STATE, EPISODE, STEP)
-
-
-def clip_length(num_frames: int, frame_skip: int) -> int:
-    """Rows an episode needs to hold one clip, from its first frame to its last.
-
-    Examples:
-        >>> clip_length(num_frames=4, frame_skip=5)
-        16
-    """
-    return (num_frames - 1) * frame_skip + 1
 
 
 class ClipStorage(TensorStorage):
@@ -212,15 +36,19 @@ class ClipStorage(TensorStorage):
     of clips, and the uniform one uniform over all legal starts. The arrays are never written to.
 
     Args:
-        store: the recorded episodes.
-        episodes: ids of the episodes to cut clips from. Those shorter than a clip contribute none.
+        store (EpisodeStore): the recorded episodes.
+        episodes (sequence of int): ids of the episodes to cut clips from. Those shorter than a clip contribute none.
 
     Keyword Args:
-        num_frames: T.
-        frame_skip: F, environment steps from one frame to the next.
-        keys: what a clip holds: ``pixels`` uint8 [T, 3, H, W], ``action`` float32 [T, F * A] (and with it
-            ``mask`` bool [T]), ``state`` float64 [T, S], ``episode`` int64 [T], ``step`` int64 [T].
-        statistics: z-scores the actions; ``None`` leaves them in environment units.
+        num_frames (int): T.
+        frame_skip (int): F, environment steps from one frame to the next.
+        keys (sequence of str, optional): what a clip holds: ``pixels`` uint8 [T, 3, H, W], ``action`` float32
+            [T, F * A] (and with it ``mask`` bool [T]), ``state`` float64 [T, S], ``episode`` int64 [T], ``step``
+            int64 [T]. Default: ``("pixels", "action")``.
+        statistics (ActionStatistics, optional): z-scores the actions. Default: ``None``, environment units.
+
+    Attributes:
+        num_short_episodes: number of episodes that are shorter than a clip.
 
     Raises:
         KeyError: an unknown key, or none.
@@ -287,7 +115,7 @@ class ClipStorage(TensorStorage):
         """Reads clips.
 
         Args:
-            index: clip numbers, of any shape.
+            index (int, slice or array of int): clip numbers, of any shape.
 
         Returns:
             A tensordict of batch size [*index.shape, T]: [T] for one number, [B, T] for a list of B.
@@ -373,3 +201,192 @@ class ClipStorage(TensorStorage):
         state = Storage.__getstate__(self)
         state.pop("_len_value", None)
         return state
+
+
+def clip_length(num_frames: int, frame_skip: int) -> int:
+    """Rows an episode needs to hold one clip, from its first frame to its last.
+
+    Args:
+        num_frames (int): T.
+        frame_skip (int): F.
+
+    Examples:
+        >>> clip_length(num_frames=4, frame_skip=5)
+        16
+    """
+    return (num_frames - 1) * frame_skip + 1
+
+
+class ClipSampler(SamplerWithoutReplacement):
+    """Draws every clip exactly once per epoch, in an order that depends on nothing but the seed.
+
+    Epoch e visits the clips in the order ``permutation(seed, e)``, and batch k of a run is the k-th piece of that
+    endless sequence of epochs. The position is therefore one number, :attr:`batches`, and :meth:`seek` reaches any
+    position at once: a resumed run continues with the very batch it would have drawn. Neither the global random
+    state nor the replay buffer's generator is used.
+
+    An item is whatever the storage counts; with :class:`~torchrl_ficreg.data.ClipStorage` it is a clip.
+
+    Processes that train one model together divide every batch: the sampler of each draws the whole batch and returns
+    the share of its rank. The shares together are the batch that one process would have drawn, and the position is the
+    same number on every rank, so that a run may be continued with another world size.
+
+    Keyword Args:
+        shuffle (bool, optional): ``False`` visits the clips in their stored order, in every epoch. Default: ``True``.
+        drop_last (bool, optional): leave out the last clips of an epoch when they do not fill a batch. With ``False``
+            the last batch of an epoch is shorter; several ranks then leave out what is not at least two clips for
+            each. Default: ``True``.
+        seed (int, optional): not negative. Default: ``0``.
+        rank (int, optional): of this process, from 0. Default: ``0``.
+        world_size (int, optional): number of processes that divide every batch. Default: ``1``.
+
+    Attributes:
+        batches: number of batches drawn so far.
+
+    Raises:
+        ValueError: a negative seed or an impossible rank; when drawing: fewer clips than one batch, a batch that the
+            ranks cannot divide equally, or another batch size or number of clips than before, under which the
+            position would mean something else.
+
+    Examples:
+        >>> from torchrl.data import ReplayBuffer, TensorStorage
+        >>> sampler = ClipSampler(seed=3)
+        >>> buffer = ReplayBuffer(storage=TensorStorage(torch.arange(6)), sampler=sampler, batch_size=2)
+        >>> first = [buffer.sample().tolist() for _ in range(3)]
+        >>> sorted(sum(first, []))
+        [0, 1, 2, 3, 4, 5]
+        >>> sampler.seek(1)
+        >>> buffer.sample().tolist() == first[1]
+        True
+    """
+
+    def __init__(
+        self,
+        *,
+        shuffle: bool = True,
+        drop_last: bool = True,
+        seed: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        super().__init__(drop_last=drop_last, shuffle=shuffle)
+        if seed < 0:
+            raise ValueError(f"seed must not be negative, got {seed}.")
+        if not 0 <= rank < world_size:
+            raise ValueError(
+                f"rank must be at least 0 and below world_size, got rank={rank} and world_size={world_size}."
+            )
+        self.seed = int(seed)
+        self.rank = int(rank)
+        self.world_size = int(world_size)
+        self.batches = 0
+        self._batch_size = 0  # 0: nothing drawn yet
+        self._num_clips = 0
+        self._order: tuple[int, np.ndarray] | None = None  # epoch and its permutation
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[torch.Tensor, dict[str, Any]]:
+        """The next batch of clip numbers, or the share of this rank: int64 [batch_size / world_size]."""
+        self._bind(len(storage), batch_size)
+        per_epoch = self.batches_per_epoch(len(storage), batch_size)
+        epoch, batch = divmod(self.batches, per_epoch)
+        index = self._epoch_order(epoch)[batch * batch_size : (batch + 1) * batch_size]
+        share = len(index) // self.world_size  # exact: only whole batches are divided among ranks
+        index = index[self.rank * share : (self.rank + 1) * share]
+        self.batches += 1
+        left = per_epoch - 1 - batch
+        # TorchRL's iteration and prefetching read these two. `ran_out` is set first: a prefetching thread that read
+        # the count of the next epoch before it would run into that epoch.
+        self._ran_out = left == 0
+        self._remaining_batches = left or per_epoch
+        return torch.from_numpy(index.copy()), {}
+
+    def batches_per_epoch(self, num_clips: int, batch_size: int) -> int:
+        """Batches of one epoch.
+
+        Args:
+            num_clips (int): items of the storage.
+            batch_size (int): clips of a batch, over all ranks.
+        """
+        served = num_clips - num_clips % self.world_size
+        if self.world_size > 1 and served >= batch_size and served % batch_size < 2 * self.world_size:
+            served -= served % batch_size  # a statistic over the batch needs two clips on every rank
+        return served // batch_size if self.drop_last else -(served // -batch_size)
+
+    def seek(self, batches: int) -> None:
+        """Moves to a position: the next batch is batch number ``batches``, counted from 0.
+
+        Args:
+            batches (int): number of batches that count as drawn.
+
+        Raises:
+            ValueError: a negative number.
+        """
+        if batches < 0:
+            raise ValueError(f"batches must not be negative, got {batches}.")
+        self.batches = int(batches)
+        self._ran_out = False
+        if self._batch_size:
+            per_epoch = self.batches_per_epoch(self._num_clips, self._batch_size)
+            self._remaining_batches = per_epoch - self.batches % per_epoch
+
+    def can_sample(self, storage: Storage, batch_size: int) -> bool:
+        """Whether the storage fills one batch."""
+        return len(storage) >= (batch_size if self.drop_last else self.world_size)
+
+    def state_dict(self) -> dict[str, int]:
+        """Plain numbers. With prefetching, ``batches`` is ahead of what was served: see :class:`OfflineTrajectories`."""
+        return {
+            "seed": self.seed,
+            "shuffle": int(self.shuffle),
+            "drop_last": int(self.drop_last),
+            "batches": self.batches,
+            "batch_size": self._batch_size,
+            "num_clips": self._num_clips,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continues the saved order, whatever seed this sampler was made with."""
+        self._empty()
+        self.seed = int(state_dict["seed"])
+        self.shuffle, self.drop_last = bool(state_dict["shuffle"]), bool(state_dict["drop_last"])
+        self._batch_size, self._num_clips = int(state_dict["batch_size"]), int(state_dict["num_clips"])
+        self.seek(int(state_dict["batches"]))
+
+    def __repr__(self) -> str:
+        flags = f"shuffle={self.shuffle}, drop_last={self.drop_last}, seed={self.seed}"
+        return f"{type(self).__name__}({flags}, batches={self.batches})"
+
+    def _bind(self, num_clips: int, batch_size: int) -> None:
+        if batch_size % self.world_size:
+            raise ValueError(
+                f"{self.world_size} processes cannot share a batch of {batch_size} clips equally: choose a multiple of "
+                f"{self.world_size}."
+            )
+        if batch_size < 1 or num_clips < (batch_size if self.drop_last else self.world_size):
+            raise ValueError(
+                f"{num_clips} clips do not fill a batch of {batch_size}: lower batch_size or pass drop_last=False."
+            )
+        if not self._batch_size:
+            self._batch_size, self._num_clips = batch_size, num_clips
+        if (num_clips, batch_size) != (self._num_clips, self._batch_size):
+            raise ValueError(
+                f"the position counts batches of {self._batch_size} out of {self._num_clips} clips, got batches of "
+                f"{batch_size} out of {num_clips}: keep both, or use a new sampler."
+            )
+
+    def _epoch_order(self, epoch: int) -> np.ndarray:
+        if self._order is None or self._order[0] != epoch:
+            clips = np.arange(self._num_clips)
+            if self.shuffle:
+                np.random.default_rng([self.seed, epoch]).shuffle(clips)
+            self._order = (epoch, clips)
+        return self._order[1]
+
+    def _empty(self) -> None:
+        self.batches = self._batch_size = self._num_clips = 0
+        self._order = None
+        self._ran_out = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The permutation has as many numbers as the dataset has clips, and can be made again.
+        return {**super().__getstate__(), "_order": None}

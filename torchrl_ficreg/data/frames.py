@@ -1,7 +1,7 @@
-"""Frames as they lie on disk: raw rows, or one losslessly compressed image each.
+"""Storage of frames: raw rows, or one losslessly compressed image per frame.
 
-Both are read through ``read(rows)``. A frame that went through a compressed file has the bytes it had before, so
-everything made from frames (batches, checksums, the fingerprint of a dataset) is the same for every format.
+Both are read through ``read(rows)``. Compression does not change a byte of a frame, so everything made from frames
+(batches, checksums, the fingerprint of a dataset) is the same for every format.
 """
 
 from __future__ import annotations
@@ -17,133 +17,32 @@ from typing import Any, get_args, Literal
 
 import numpy as np
 
-
-class Recycler:
-    """Hands out uninitialised byte arrays and takes their memory back when the last user has dropped them.
-
-    The kernel clears every page before a process sees it, which takes almost as long as filling a batch of clips (77 MB
-    at 3 x 224 x 224) with frames, and the allocator gives blocks of that size back at once. So the last few blocks
-    are kept. An array is the caller's for as long as he, or a view or a tensor made from it, holds on to it: only
-    the destruction of the array puts its memory on the shelf.
-
-    Keyword Args:
-        keep: blocks that wait for their next use; the memory this costs is ``keep`` times one array.
-        smallest: bytes below which the allocator does as well.
-
-    Examples:
-        >>> recycler = Recycler(smallest=1)
-        >>> first = recycler.empty((2, 3))
-        >>> address, view = first.ctypes.data, first[0]
-        >>> del first
-        >>> recycler.empty((2, 3)).ctypes.data == address  # the view still looks at it
-        False
-        >>> del view
-        >>> recycler.empty((2, 3)).ctypes.data == address
-        True
-    """
-
-    def __init__(self, *, keep: int = 2, smallest: int = 1 << 20) -> None:
-        self.smallest = smallest
-        # Appending and popping are atomic: memory comes back in whichever thread drops it, even amid a collection
-        # of garbage, where waiting for a lock could be waiting for oneself.
-        self._shelf: deque[np.ndarray] = deque(maxlen=keep)
-
-    def empty(self, shape: tuple[int, ...]) -> np.ndarray:
-        """An uninitialised, contiguous, writable uint8 array."""
-        size = prod(shape)
-        if size < self.smallest:
-            return np.empty(shape, np.uint8)
-        memory = self._take(size)
-        # Views of a view refer to its owner, not to it, unless the owner is no array: hence the memoryview. With it
-        # every view keeps `loan` alive.
-        loan = np.frombuffer(memoryview(memory), np.uint8)
-        weakref.finalize(loan, self._shelf.append, memory).atexit = False
-        return loan.reshape(shape)
-
-    def _take(self, size: int) -> np.ndarray:
-        while self._shelf:
-            try:
-                memory = self._shelf.pop()
-            except IndexError:  # another thread was faster
-                break
-            if memory.size == size:  # others belong to a batch size that is not asked for any more
-                return memory
-        return np.empty(size, np.uint8)
-
-
-MOST_THREADS = 8  # more readers than this only take cores from the training step
-
-_pools: dict[int, ThreadPoolExecutor] = {}
-
-# A forked child has the pools but not their threads, and would wait for them for ever.
-if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
-    os.register_at_fork(after_in_child=_pools.clear)
-
-
-def default_threads() -> int:
-    """The cores this process may use, at most eight.
-
-    Examples:
-        >>> 1 <= default_threads() <= 8
-        True
-    """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MOST_THREADS)
-
-
-def run_split(work: Callable[[int, int], None], count: int, *, num_threads: int, smallest: int = 1) -> None:
-    """Calls ``work(start, stop)`` until ``range(count)`` is covered, on several threads where that pays.
-
-    Args:
-        work: handles the items ``start`` to ``stop - 1``; pieces never overlap. It must not call this function.
-        count: number of items.
-
-    Keyword Args:
-        num_threads: most threads. With 1, or with too few items, the work is done in the calling thread.
-        smallest: items below which a piece is not worth handing over.
-
-    Raises:
-        whatever ``work`` raises: of several errors, that of the first piece.
-
-    Examples:
-        >>> squares = [0] * 5
-        >>> def work(start, stop):
-        ...     for item in range(start, stop):
-        ...         squares[item] = item**2
-        >>> run_split(work, 5, num_threads=2)
-        >>> squares
-        [0, 1, 4, 9, 16]
-    """
-    pieces = min(num_threads * 4, count // smallest)  # four per thread, as images differ in the time they take
-    if num_threads <= 1 or pieces <= 1:
-        return work(0, count)
-    if num_threads not in _pools:
-        _pools[num_threads] = ThreadPoolExecutor(num_threads, thread_name_prefix="frames")
-    bounds = [count * piece // pieces for piece in range(pieces + 1)]
-    futures = [_pools[num_threads].submit(work, *piece) for piece in zip(bounds[:-1], bounds[1:])]
-    errors = [error for error in [future.exception() for future in futures] if error is not None]
-    if errors:
-        raise errors[0]
-
+from torchrl_ficreg._utils import require
 
 FrameFormat = Literal["raw", "webp", "png"]
 FRAME_FORMATS = get_args(FrameFormat)
 
-# Fast rather than small: WebP's default effort takes three to five times as long for files that are 0 to 16 % smaller;
-# its least effort is three times as fast but makes the flat pictures of PushT seven times as large.
+# Chosen for speed: WebP's default effort takes three to five times as long for files that are 0 to 16 % smaller; its
+# lowest effort is three times as fast but makes the flat pictures of PushT seven times as large.
 _SAVE_OPTIONS: dict[str, dict[str, Any]] = {
     "webp": {"format": "WEBP", "lossless": True, "quality": 20, "method": 1},
     "png": {"format": "PNG", "compress_level": 6},
 }
 
-# Measured for (TwoRoom, PushT, Reacher, Cube): webp 7-10, 9, 29-44, 39-53 (64-224 px); png 11-16, 14-20, 33-54, 48-65.
+# Measured bytes per pixel of a side at 64 to 224 px, for (TwoRoom, PushT, Reacher, Cube): webp 7-10, 9, 29-44, 39-53;
+# png 11-16, 14-20, 33-54, 48-65.
 _BYTES_PER_SIDE = {"webp": 60, "png": 80}
 
 _BYTES_PER_THREAD = 4 << 20  # below this a thread costs more than it copies
 
+MOST_THREADS = 8  # more readers than this only take cores from the training step
+
 
 def check_frame_format(frames: str) -> None:
-    """Checks that frames can be kept in this format here.
+    """Checks that frames can be stored in a format.
+
+    Args:
+        frames (str): ``"raw"``, ``"webp"`` or ``"png"``.
 
     Raises:
         ImportError: the format needs Pillow, or a Pillow with WebP, which is not installed.
@@ -156,21 +55,28 @@ def check_frame_format(frames: str) -> None:
         raise ValueError(f"frames must be one of {FRAME_FORMATS}, got {frames!r}.")
     if frames == "raw":
         return
-    try:
-        from PIL import features, PngImagePlugin, WebPImagePlugin  # noqa: F401 (importing registers the formats)
-    except ImportError as error:
-        hint = "pip install 'torchrl_ficreg[data]'"
-        raise ImportError(f"frames={frames!r} needs Pillow: {hint}, or record with frames='raw'.") from error
+    modules = (
+        "PIL.PngImagePlugin",
+        "PIL.WebPImagePlugin",
+        "PIL.features",
+    )  # importing the first two registers the formats
+    purpose = f"frames={frames!r}, unlike frames='raw',"
+    features = [require(module, "data", purpose=purpose, package="Pillow") for module in modules][-1]
     if frames == "webp" and not features.check("webp"):
         hint = "install Pillow from its wheels, or use frames='png'"
         raise ImportError(f"frames='webp' needs a Pillow with WebP, this one was built without: {hint}.")
 
 
 def frame_bytes(height: int, width: int, frames: FrameFormat) -> int:
-    """Disk space of one frame with what finds it again, in bytes: exact for raw frames, else above the average.
+    """Disk space of one frame and its index entry, in bytes: exact for raw frames, otherwise above the average.
 
-    What an image costs is its edges, whose length grows with its side, not with its area. The factors are a little
-    above the largest of the four environments, Cube.
+    The size of a compressed image is mainly that of its edges, whose length grows with its side, not with its area. The
+    factors are slightly above the largest of the four environments, Cube.
+
+    Args:
+        height (int): pixels.
+        width (int): pixels.
+        frames (str): the format.
     """
     raw = 3 * height * width
     return raw if frames == "raw" else min(raw, round(_BYTES_PER_SIDE[frames] * (height * width) ** 0.5)) + 8
@@ -180,14 +86,14 @@ def encode_frames(pixels: np.ndarray, frames: FrameFormat, *, num_threads: int |
     """Compresses frames without loss.
 
     Args:
-        pixels: uint8 [L, 3, H, W].
-        frames: ``"webp"`` or ``"png"``.
+        pixels (ndarray): uint8 [L, 3, H, W].
+        frames (str): ``"webp"`` or ``"png"``.
 
     Keyword Args:
-        num_threads: frames compressed at a time. Default: the usable cores, at most eight.
+        num_threads (int, optional): frames compressed at a time. Default: the usable cores, at most eight.
 
     Returns:
-        L files, which do not depend on the number of threads.
+        L encoded images, which do not depend on the number of threads.
 
     Examples:
         >>> images = encode_frames(np.zeros((2, 3, 64, 64), np.uint8), "png")
@@ -196,7 +102,7 @@ def encode_frames(pixels: np.ndarray, frames: FrameFormat, *, num_threads: int |
     """
     check_frame_format(frames)
     if frames == "raw":
-        raise ValueError("raw frames are rows of bytes, not images: encode to 'webp' or 'png'.")
+        raise ValueError("raw frames are not encoded: choose 'webp' or 'png'.")
     from PIL import Image
 
     images: list[bytes] = [b""] * len(pixels)
@@ -212,13 +118,13 @@ def encode_frames(pixels: np.ndarray, frames: FrameFormat, *, num_threads: int |
 
 
 class RawFrames:
-    """Frames that lie in memory, or in a file mapped into it, as they are.
+    """Uncompressed frames in memory or in a mapped file.
 
     Args:
-        array: uint8 [N, 3, H, W].
+        array (ndarray): uint8 [N, 3, H, W].
 
     Keyword Args:
-        num_threads: threads that copy. Default: the usable cores, at most eight.
+        num_threads (int, optional): threads that copy. Default: the usable cores, at most eight.
 
     Examples:
         >>> frames = RawFrames(np.arange(48, dtype=np.uint8).reshape(4, 3, 2, 2))
@@ -229,7 +135,7 @@ class RawFrames:
     def __init__(self, array: np.ndarray, *, num_threads: int | None = None) -> None:
         self._array = np.ascontiguousarray(array)
         self._num_threads = num_threads or default_threads()
-        self._recycler = Recycler()
+        self._buffers = BufferPool()
 
     def __len__(self) -> int:
         return len(self._array)
@@ -239,11 +145,11 @@ class RawFrames:
         if isinstance(rows, slice):
             return self._array[rows]
         flat = _flat_rows(rows, len(self))  # [N]
-        out = self._recycler.empty((len(flat), *self._array.shape[1:]))
+        out = self._buffers.empty((len(flat), *self._array.shape[1:]))
 
         def work(start: int, stop: int) -> None:
-            # Many times as fast as torch's advanced indexing, and without its thread pool, which belongs to the
-            # training step. "clip" writes into `out` at once; the rows have been checked.
+            # Many times as fast as torch's advanced indexing, and without its thread pool, which the training step uses.
+            # With mode="clip" numpy writes into `out` without a buffer; the rows have been checked.
             np.take(self._array, flat[start:stop], axis=0, out=out[start:stop], mode="clip")
 
         smallest = max(1, _BYTES_PER_THREAD // max(1, self._array[0].nbytes))
@@ -252,18 +158,18 @@ class RawFrames:
 
 
 class ImageFrames:
-    """Frames that are images, one after another in one block of bytes.
+    """Compressed frames, one image after another in one block of bytes.
 
     Args:
-        blob: the images.
-        ends: int64 [N], one past the last byte of each.
-        shape: (3, H, W).
-        frames: ``"webp"`` or ``"png"``.
+        blob (bytes-like): the images.
+        ends (ndarray): int64 [N], one past the last byte of each.
+        shape (tuple of int): (3, H, W).
+        frames (str): ``"webp"`` or ``"png"``.
 
     Keyword Args:
-        num_threads: images decoded at a time: Pillow decodes without holding the interpreter. Default: the usable
-            cores, at most eight. The result does not depend on it.
-        where: the dataset they belong to, for errors.
+        num_threads (int, optional): images decoded at a time: Pillow releases the interpreter lock. The result does not
+            depend on it. Default: the usable cores, at most eight.
+        where (str, optional): the dataset they belong to, for errors. Default: ``""``.
 
     Raises:
         ValueError: the first image has another size than ``shape``, or is damaged.
@@ -293,9 +199,9 @@ class ImageFrames:
         self._shape = shape
         self._decode = _decoder(frames, shape)
         self._num_threads = num_threads or default_threads()
-        self._recycler = Recycler()
+        self._buffers = BufferPool()
         self._where = f"{where}: " if where else ""
-        if len(ends):  # before memory for frames of this shape is asked for
+        if len(ends):  # before memory for frames of this shape is allocated
             self._decode_row(0, None)
 
     def __len__(self) -> int:
@@ -307,7 +213,7 @@ class ImageFrames:
         begin = self._ends[row - 1] if row else 0
         try:
             self._decode(self._blob[begin : self._ends[row]], frame)
-        # All of them come out of Pillow.
+        # Pillow raises all of these.
         except (ValueError, OSError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
             raise ValueError(
                 f"{self._where}the image of row {row} is damaged ({error}): restore the files or collect again."
@@ -322,7 +228,7 @@ class ImageFrames:
         if isinstance(rows, slice):
             rows = np.arange(*rows.indices(len(self)))
         flat = _flat_rows(rows, len(self))  # [N]
-        out = self._recycler.empty((len(flat), *self._shape))
+        out = self._buffers.empty((len(flat), *self._shape))
 
         def work(start: int, stop: int) -> None:
             for row, frame in zip(flat[start:stop].tolist(), out[start:stop]):
@@ -349,7 +255,7 @@ def _flat_rows(rows: np.ndarray, count: int) -> np.ndarray:
 
 
 def _decoder(frames: FrameFormat, shape: tuple[int, ...]) -> Callable[[memoryview, np.ndarray | None], None]:
-    """A function that decodes one image into a frame [3, H, W]; without a frame it looks at the size alone."""
+    """A function that decodes one image into a frame [3, H, W]; without a frame it only checks the size."""
     from PIL import Image
 
     _, height, width = shape
@@ -362,8 +268,120 @@ def _decoder(frames: FrameFormat, shape: tuple[int, ...]) -> Callable[[memoryvie
                 raise ValueError(f"it is {got}, expected RGB {height} x {width}")
             if frame is None:
                 return
-            # Channel by channel: Pillow is twice as fast at pulling one out as numpy at transposing the picture.
+            # Channel by channel: Pillow extracts one twice as fast as numpy transposes the picture.
             for channel, name in zip(frame, "RGB"):
                 channel[...] = np.frombuffer(image.tobytes("raw", name), np.uint8).reshape(height, width)
 
     return decode
+
+
+# ------------------------------------------------------------------ threads and memory
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+
+# A forked child has the pools but not their threads, and would wait for them for ever.
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
+    os.register_at_fork(after_in_child=_pools.clear)
+
+
+def default_threads() -> int:
+    """Number of cores that this process may use, at most eight.
+
+    Examples:
+        >>> 1 <= default_threads() <= 8
+        True
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, MOST_THREADS)
+
+
+def run_split(work: Callable[[int, int], None], count: int, *, num_threads: int, smallest: int = 1) -> None:
+    """Calls ``work(start, stop)`` for consecutive pieces of ``range(count)``, on several threads if there are enough items.
+
+    Args:
+        work (callable): handles the items ``start`` to ``stop - 1``. It must not call this function.
+        count (int): number of items.
+
+    Keyword Args:
+        num_threads (int): largest number of threads. With 1, or with too few items, ``work`` runs in the calling thread.
+        smallest (int, optional): fewest items of a piece. Default: ``1``.
+
+    Raises:
+        whatever ``work`` raises: of several errors, that of the first piece.
+
+    Examples:
+        >>> squares = [0] * 5
+        >>> def work(start, stop):
+        ...     for item in range(start, stop):
+        ...         squares[item] = item**2
+        >>> run_split(work, 5, num_threads=2)
+        >>> squares
+        [0, 1, 4, 9, 16]
+    """
+    pieces = min(num_threads * 4, count // smallest)  # four per thread, as images differ in the time they take
+    if num_threads <= 1 or pieces <= 1:
+        return work(0, count)
+    if num_threads not in _pools:
+        _pools[num_threads] = ThreadPoolExecutor(num_threads, thread_name_prefix="frames")
+    bounds = [count * piece // pieces for piece in range(pieces + 1)]
+    futures = [_pools[num_threads].submit(work, *piece) for piece in zip(bounds[:-1], bounds[1:])]
+    errors = [error for error in [future.exception() for future in futures] if error is not None]
+    if errors:
+        raise errors[0]
+
+
+class BufferPool:
+    """Hands out uninitialised byte arrays; a buffer is used again once the last reference to it is gone.
+
+    The kernel clears every page before a process can use it, which takes almost as long as filling a batch of clips
+    (77 MB at 3 x 224 x 224) with frames, and the allocator returns blocks of that size to the kernel at once. So the
+    last few blocks are kept. A buffer returns to the pool when the last reference (array, view or tensor) is
+    garbage-collected.
+
+    Keyword Args:
+        keep (int, optional): number of free buffers that are kept; each takes the memory of one array. Default: ``2``.
+        smallest (int, optional): arrays of fewer bytes are left to the allocator. Default: 1 MiB.
+
+    Examples:
+        >>> pool = BufferPool(smallest=1)
+        >>> first = pool.empty((2, 3))
+        >>> address, view = first.ctypes.data, first[0]
+        >>> del first
+        >>> pool.empty((2, 3)).ctypes.data == address  # the view still refers to it
+        False
+        >>> del view
+        >>> pool.empty((2, 3)).ctypes.data == address
+        True
+    """
+
+    def __init__(self, *, keep: int = 2, smallest: int = 1 << 20) -> None:
+        self.smallest = smallest
+        # A deque, whose appending and popping are atomic, instead of a lock: a buffer may return in any thread, even
+        # during a garbage collection within `empty`, where waiting for a lock would be a deadlock.
+        self._free: deque[np.ndarray] = deque(maxlen=keep)
+
+    def empty(self, shape: tuple[int, ...]) -> np.ndarray:
+        """An uninitialised, contiguous, writable uint8 array.
+
+        Args:
+            shape (tuple of int): its shape.
+        """
+        size = prod(shape)
+        if size < self.smallest:
+            return np.empty(shape, np.uint8)
+        memory = self._take(size)
+        # A view of a view refers to the owner of the memory instead of the view, unless the owner is no array: hence
+        # the memoryview, through which every view keeps `loan` alive.
+        loan = np.frombuffer(memoryview(memory), np.uint8)
+        weakref.finalize(loan, self._free.append, memory).atexit = False
+        return loan.reshape(shape)
+
+    def _take(self, size: int) -> np.ndarray:
+        while self._free:
+            try:
+                memory = self._free.pop()
+            except IndexError:  # another thread was faster
+                break
+            if memory.size == size:  # other sizes belong to a batch size that is no longer used
+                return memory
+        return np.empty(size, np.uint8)

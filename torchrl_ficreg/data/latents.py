@@ -1,4 +1,4 @@
-"""Episodes seen through a frozen encoder: encoded once, then drawn from as clips or as ways to a goal."""
+"""Latents of recorded episodes: encoded once by a frozen encoder, then sampled as clips or as pairs of frame and goal."""
 
 from __future__ import annotations
 
@@ -25,11 +25,13 @@ def encode_episodes(
     """The latent of every frame of a split, each frame encoded once.
 
     Args:
-        dataset: the episodes; its clips play no part.
-        encode: frames [n, 3, H, W] uint8 -> latents [n, D]. It takes care of device and precision; where it leaves its
-            result, the latents stay.
-        batch_size: frames encoded together.
-        description: of the progress bar; None shows none.
+        dataset (OfflineTrajectories): the episodes; its clips are not used.
+        encode (callable): frames [n, 3, H, W] uint8 -> latents [n, D]. It handles device and precision; the latents stay
+            on the device of its result.
+
+    Keyword Args:
+        batch_size (int, optional): frames encoded at once. Default: ``256``.
+        description (str, optional): text of the progress bar. Default: ``None``, no bar.
 
     Returns:
         float32 [N, D], episode after episode in the order of ``dataset.episodes``.
@@ -67,7 +69,7 @@ def encode_episodes(
 
 
 def _frames(dataset: OfflineTrajectories, batch_size: int) -> Iterator[torch.Tensor]:
-    """All frames in order, ``batch_size`` at a time, with episodes joined where they are short."""
+    """All frames in order, ``batch_size`` at a time; a batch may hold frames of several episodes."""
     table = dataset.episodes
     waiting = []
     missing = batch_size
@@ -93,22 +95,22 @@ def _check_latents(dataset: OfflineTrajectories, latent: torch.Tensor) -> None:
 
 
 def _actions_and_blocks(dataset: OfflineTrajectories) -> tuple[torch.Tensor, torch.Tensor]:
-    """Z-scored actions [N, A] and how many whole action blocks follow each row [N] int64."""
+    """Z-scored actions [N, A] and the number of whole action blocks that follow each row, int64 [N]."""
     table = dataset.episodes
     episodes, length = table["episode"].tolist(), table["length"]  # [E]
     raw = torch.cat([dataset.episode_data(episode, keys=(ACTION,))[ACTION] for episode in episodes])  # [N, A]
     step = torch.cat([torch.arange(rows) for rows in length.tolist()])  # [N], within its episode
-    # The last row of an episode has no action, so blocks end before it; its frame may still be the end of one.
+    # The last row of an episode has no action, so no block contains it; its frame may follow one.
     blocks = (length.repeat_interleave(length) - 1 - step) // dataset.frame_skip
     return dataset.statistics.normalize(raw), blocks
 
 
 class LatentClips:
-    """Clips of latents instead of frames, drawn with replacement: a predictor trains on them in a fraction of the time.
+    """Clips of latents instead of frames, drawn with replacement, to train a predictor in a fraction of the time.
 
     Args:
-        dataset: the episodes, whose statistics z-score the actions and whose ``num_frames`` is T.
-        latent: [N, D], what :func:`encode_episodes` returned for them.
+        dataset (OfflineTrajectories): the episodes; its statistics z-score the actions, its ``num_frames`` is T.
+        latent (Tensor): [N, D], the result of :func:`encode_episodes` for them.
 
     Raises:
         ValueError: the latents belong to other episodes.
@@ -140,8 +142,10 @@ class LatentClips:
         """Draws clips.
 
         Args:
-            batch_size: B.
-            generator: of the draws, on the CPU.
+            batch_size (int): B.
+
+        Keyword Args:
+            generator (torch.Generator, optional): of the draws, on the CPU. Default: ``None``, the global one.
 
         Returns:
             [B, T]: ``latent`` [B, T, D] and z-scored ``action`` blocks [B, T, F * A]; the last block, which leads out
@@ -156,21 +160,23 @@ class LatentClips:
 
 
 class GoalRows:
-    """Rows to learn from how a recorded agent got from here to there.
+    """Training data of a goal-conditioned policy: a frame, a later frame as its goal, and the action block between them.
 
     A row begins at any step s of an episode from which a whole action block stays inside the episode. Its goal is the
-    frame k blocks later, k uniform among 1 ... ``max_blocks`` as far as the episode goes::
+    frame k blocks later, k uniform in 1 ... ``max_blocks`` up to the end of the episode::
 
         step     s           s+F         ...         s+kF
         latent   latent                              goal_latent
         action   [--action--)
 
-    :meth:`sample` draws s and k anew each time, so an epoch has no meaning here.
+    :meth:`sample` draws s and k anew each time, so there are no epochs.
 
     Args:
-        dataset: the episodes, whose statistics z-score the actions.
-        latent: [N, D], what :func:`encode_episodes` returned for them.
-        max_blocks: the farthest goal, in action blocks.
+        dataset (OfflineTrajectories): the episodes; its statistics z-score the actions.
+        latent (Tensor): [N, D], the result of :func:`encode_episodes` for them.
+
+    Keyword Args:
+        max_blocks (int): the most distant goal, in action blocks.
 
     Attributes:
         reach: int64 [M], the largest k of each of the M starts.
@@ -211,8 +217,11 @@ class GoalRows:
         """Draws rows, with replacement.
 
         Args:
-            batch_size: B.
-            generator: of the draws, on the CPU; the same draws whatever device the latents are on.
+            batch_size (int): B.
+
+        Keyword Args:
+            generator (torch.Generator, optional): of the draws, on the CPU: they do not depend on the device of the
+                latents. Default: ``None``, the global one.
 
         Returns:
             [B]: ``latent`` and ``goal_latent`` [B, D], z-scored ``action`` [B, F * A] and ``blocks`` [B] int64, the k

@@ -1,4 +1,4 @@
-"""What a dataset directory looks like, and how its two text files are read and written.
+"""Layout of a dataset directory, and reading and writing of its header and index.
 
 ::
 
@@ -9,14 +9,14 @@
       action.memmap
       state.memmap
 
-With compressed frames two files stand in for ``pixels.memmap``::
+With compressed frames two files replace ``pixels.memmap``::
 
       pixels.blob        one lossless image per row, one after another
       pixels.offsets     int64 per row: one past the last byte of its image
 
-The index alone says what exists. Bytes of a data file beyond the rows of the last index line belong to an
-episode that was never committed, and a last line without its newline was never committed either: readers
-ignore both, a writer cuts them off. Everything else that does not fit is damage and raises.
+The index alone defines the episodes of a dataset. Bytes of a data file beyond the rows of the last index line belong
+to an episode that was not committed, and a last line without its newline was not committed either: readers ignore
+both, a writer truncates them. Any other mismatch is damage and raises an error.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from torchrl_ficreg.data.frames import frame_bytes, FRAME_FORMATS, FrameFormat
 from torchrl_ficreg.keys import ACTION, PIXELS, STATE
 
 FORMAT = "torchrl_ficreg.episodes"
-# Version 2 has compressed frames. Raw datasets stay at version 1: code that knows nothing else reads them as before.
+# Version 2 has compressed frames. Raw datasets stay at version 1, so that older code can read them.
 VERSIONS = (1, 2)
 _MOST = 2**40  # above any number of rows, episodes or bytes of a row; products of two fit into 63 or 64 bits
 META_FILE = "meta.json"
@@ -47,7 +47,7 @@ DTYPES = {PIXELS: np.dtype("<u1"), ACTION: np.dtype("<f4"), STATE: np.dtype("<f8
 BLOB, OFFSETS = "pixels.blob", "pixels.offsets"
 OFFSET_DTYPE = np.dtype("<i8")
 
-COLLECT_HINT = "collect it with `python sota-implementations/ficreg/collect.py env={env}`"
+COLLECT_HINT = "record it with collect_episodes() or `python sota-implementations/ficreg/collect.py env={env}`"
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Header:
 
     @property
     def shapes_crc(self) -> int:
-        """crc32 of the row shapes: rows of one size can have several, between which no other checksum tells."""
+        """crc32 of the row shapes: rows of one size can have several shapes, which no other checksum distinguishes."""
         return zlib.crc32(json.dumps({key: list(self.shapes[key]) for key in DTYPES}).encode())
 
     def with_target(self, target_episodes: int) -> Header:
@@ -106,7 +106,11 @@ class Header:
 
     @classmethod
     def from_json(cls, text: str | bytes, where: str | Path) -> Header:
-        """Reads ``meta.json``; ``where`` names it in errors.
+        """Reads ``meta.json``.
+
+        Args:
+            text (str or bytes): its content.
+            where (str or Path): its path, for errors.
 
         Raises:
             ValueError: no JSON, not this format, another version, or a field that is missing or cannot be.
@@ -132,7 +136,7 @@ class Header:
         for name, good in checks.items():
             if not good:
                 got = repr(content[name])[:120] if name in content else "nothing"
-                raise ValueError(f"{where} lacks or garbles the field {name!r}, {got}: collect or copy it again.")
+                raise ValueError(f"{where} has a missing or invalid field {name!r}, {got}: collect or copy it again.")
         header = cls(target, {key: tuple(shapes[key]) for key in DTYPES}, content["meta"], frames)
         if content.get("shapes_crc", header.shapes_crc) != header.shapes_crc:  # absent from older datasets
             raise ValueError(f"{where}: the row shapes {shapes} do not match their checksum: collect or copy it again.")
@@ -200,7 +204,7 @@ class IndexEntry(NamedTuple):
         return self.start + self.length
 
     def to_line(self) -> bytes:
-        """The line, newline included: a line without it does not count."""
+        """The line with its newline, without which it does not count."""
         return json.dumps(self._asdict()).encode() + b"\n"
 
 
@@ -208,14 +212,14 @@ def parse_index(content: bytes, where: str | Path) -> tuple[list[IndexEntry], in
     """Reads the index and drops a torn last line.
 
     Args:
-        content: the bytes of ``episodes.jsonl``.
-        where: its name, for errors.
+        content (bytes): of ``episodes.jsonl``.
+        where (str or Path): its path, for errors.
 
     Returns:
-        The committed episodes, and how many leading bytes of ``content`` they occupy.
+        The committed episodes, and the number of leading bytes of ``content`` that they occupy.
 
     Raises:
-        ValueError: a whole line is garbled, or does not continue the one before it.
+        ValueError: a whole line is invalid, or does not continue the one before it.
 
     Examples:
         >>> first = IndexEntry(1, 0, 21, 7, 8)
@@ -230,7 +234,7 @@ def parse_index(content: bytes, where: str | Path) -> tuple[list[IndexEntry], in
             entry = IndexEntry(**json.loads(line))
             whole = all(isinstance(value, int) and not isinstance(value, bool) for value in entry)
         except (ValueError, TypeError, RecursionError) as error:
-            raise ValueError(f"{where}, line {number} is garbled: restore the file or collect again.") from error
+            raise ValueError(f"{where}, line {number} is invalid: restore the file or collect again.") from error
         expected = (number, entries[-1].stop if entries else 0)
         whole = whole and all(0 <= crc < 2**32 for crc in (entry.crc, entry.pixels_crc))
         if not whole or (entry.episode, entry.start) != expected or not 1 <= entry.length < _MOST - entry.start:
@@ -259,7 +263,7 @@ def data_file(path: Path, key: str) -> Path:
 
 
 def check_sizes(path: Path, header: Header, num_steps: int) -> None:
-    """Checks that every data file is long enough for the rows that the index promises.
+    """Checks that every data file is long enough for the rows of the index.
 
     Raises:
         ValueError: a data file is missing or too short.
@@ -272,7 +276,7 @@ def check_sizes(path: Path, header: Header, num_steps: int) -> None:
 
 
 def read_offsets(path: Path, num_steps: int) -> np.ndarray:
-    """Where the image of each row ends, int64 [num_steps], in bytes of ``pixels.blob``.
+    """The end of each row's image, int64 [num_steps], in bytes of ``pixels.blob``.
 
     Raises:
         ValueError: the file is missing, too short, or its numbers do not increase.
@@ -302,15 +306,15 @@ def estimate_bytes(
     state_dim: int,
     frames: FrameFormat = "raw",
 ) -> int:
-    """Disk space that ``num_steps`` rows take, in bytes: exact for raw frames, on the safe side for the others.
+    """Disk space of ``num_steps`` rows, in bytes: exact for raw frames, an upper estimate for compressed ones.
 
     Args:
-        num_steps: rows over all episodes.
-        image_size: pixels of a side, or (height, width).
-        action_dim: A.
-        state_dim: S.
-        frames: how the frames are stored. Compressed ones are taken for drawings and simple renderings, as the
-            environments of this package make them; photographs need more.
+        num_steps (int): rows over all episodes.
+        image_size (int or tuple of int): pixels of a side, or (height, width).
+        action_dim (int): A.
+        state_dim (int): S.
+        frames (str, optional): how the frames are stored. The estimate of compressed ones holds for drawings and simple
+            renderings, such as those of the environments of this package; photographs need more. Default: ``"raw"``.
 
     Examples:
         >>> estimate_bytes(10_000, 64, action_dim=2, state_dim=4)  # 123 MB
@@ -324,7 +328,7 @@ def estimate_bytes(
 
 
 def write_header(path: Path, header: Header) -> None:
-    """Writes ``meta.json`` so that a crash leaves the old file or the new one, never a half."""
+    """Writes ``meta.json`` atomically: a crash leaves the old file or the new one."""
     write_atomic(path / META_FILE, header.to_json())
     sync_directory(path)
 
@@ -336,7 +340,7 @@ def sync_directory(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
-    except OSError as error:  # CIFS, FUSE and others do not know how
+    except OSError as error:  # CIFS, FUSE and others do not support it
         if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS):
             raise
     finally:
@@ -347,8 +351,8 @@ def check_episode(episode: dict[str, np.ndarray]) -> int:
     """Checks one recorded episode against the key contract.
 
     Args:
-        episode: arrays ``pixels`` [L, 3, H, W] uint8, ``action`` [L, A] float32 and ``state`` [L, S] float64
-            (S = 0 where there is none), where row t holds the frame, the action that leads from it, and the state it was drawn from.
+        episode (dict): arrays ``pixels`` [L, 3, H, W] uint8, ``action`` [L, A] float32 and ``state`` [L, S] float64
+            (S = 0 without a simulator). Row t holds a frame, the action taken there, and the state it was drawn from.
 
     Returns:
         L, the number of steps.
@@ -373,7 +377,7 @@ def check_episode(episode: dict[str, np.ndarray]) -> int:
         if value.ndim != ndim or value.dtype != dtype:
             want = f"{ndim}-d {np.dtype(dtype).name}"
             raise ValueError(f"{key!r} must be {want}, got {value.ndim}-d {value.dtype}: convert it before writing.")
-        if not value.size and (key != STATE or value.shape[1:] != (0,)):  # data without a simulator have no state
+        if not value.size and (key != STATE or value.shape[1:] != (0,)):  # only the state may be empty
             raise ValueError(f"{key!r} must hold at least one number per step, got shape {value.shape}.")
         if key != PIXELS and not np.isfinite(value).all():
             raise ValueError(f"{key!r} holds a NaN or an infinity: drop those steps before writing.")

@@ -1,4 +1,4 @@
-"""Several dataset directories opened as one: what processes or machines recorded side by side.
+"""Several dataset directories opened as one dataset, as several processes or machines recorded them.
 
 ::
 
@@ -24,7 +24,8 @@ from torchrl_ficreg.data.store import EpisodeStore, Verify
 from torchrl_ficreg.keys import PIXELS
 
 SHARD = "shard-{}"
-SHARD_NUMBER, NUM_SHARDS = "shard", "shards"  # what a shard notes about itself, from 0, and about all
+# Fields of a shard's meta: its number, from 0, and the number of all shards.
+SHARD_NUMBER, NUM_SHARDS = "shard", "shards"
 
 
 def open_store(
@@ -37,16 +38,22 @@ def open_store(
     """Opens a dataset directory, a directory of shards, or a list of directories.
 
     Args:
-        path: one of the three. Of a list, a directory of shards counts as all of them. Episodes are numbered by the
-            shards' own numbers where each notes one, else by the order of the list: another order, another split.
-        allow_incomplete: see :meth:`EpisodeStore.open`.
-        verify: see :meth:`EpisodeStore.open`; of each shard.
-        num_threads: see :meth:`EpisodeStore.open`.
+        path (str, Path or sequence of them): one of the three. In a list, a directory of shards stands for all of them.
+            Episodes are numbered by the numbers that the shards have in their meta, otherwise by the order of the list,
+            which then decides the split.
+
+    Keyword Args:
+        allow_incomplete (bool, optional): accept fewer episodes, or shards, than the target. Default: ``False``.
+        verify (str, optional): which checksums of each shard to compare: ``"ends"``, those of the first and last
+            episode, ``"full"``, all, or ``"none"``. Default: ``"ends"``.
+        num_threads (int, optional): threads that copy or decode frames. Default: the usable cores, at most eight.
+
+    Returns:
+        the episodes, for :class:`~torchrl_ficreg.data.OfflineTrajectories`.
 
     Raises:
         FileNotFoundError: there is no dataset.
-        ValueError: one is damaged, incomplete or named twice, or they differ in their frames, row shapes or what they
-            note.
+        ValueError: one is damaged, incomplete or listed twice, or they differ in frame format, row shapes or meta.
     """
     options = {"allow_incomplete": allow_incomplete, "verify": verify, "num_threads": num_threads}
     folder = Path(path) if isinstance(path, (str, Path)) else None
@@ -64,7 +71,7 @@ def open_store(
 
 
 def shard_paths(folder: Path) -> list[Path]:
-    """The shards of a directory, by number: those that have begun.
+    """The shards of a directory that have a header, by number.
 
     Raises:
         ValueError: two have the same number, such as ``shard-0`` and ``shard-00``.
@@ -80,7 +87,7 @@ def shard_paths(folder: Path) -> list[Path]:
 
 
 def shard_meta(folder: Path) -> dict[str, Any] | None:
-    """What the first shard of a directory notes, though it may hold no episode yet; None where none has begun.
+    """The meta of the first shard of a directory, which may hold no episode yet; None where there is no shard.
 
     Raises:
         ValueError: the shard was not recorded as one.
@@ -97,16 +104,17 @@ def shard_meta(folder: Path) -> dict[str, Any] | None:
 class ShardedStore(EpisodeStore):
     """The episodes of several stores, one of each in turn, as if they had been recorded in that order.
 
-    W processes of which number w records the episodes w, w + W, w + 2 W, ... thus make the very dataset that one
-    process makes: same episode ids, hence same splits and clips, and same fingerprint. Actions and states are copied
-    into memory; frames stay where they are.
+    If process w of W records the episodes w, w + W, w + 2 W, ..., the result is the dataset that one process would
+    record: same episode ids, hence same splits and clips, and same fingerprint. Actions and states are copied into
+    memory; frames stay in the shards.
 
     Args:
-        shards: opened stores; where each notes its number they are taken in that order.
-        path: the directory that holds them, if one does; frozen start-goal pairs are kept there.
+        shards (sequence of EpisodeStore): opened stores; sorted by the numbers in their meta where each has one.
+        path (Path, optional): the directory that holds them, where frozen start-goal pairs are stored.
+            Default: ``None``.
 
     Raises:
-        ValueError: the shards differ in their frames, row shapes or what they note, or two have the same number.
+        ValueError: the shards differ in frame format, row shapes or meta, or two have the same number.
     """
 
     def __init__(self, shards: Sequence[EpisodeStore], path: Path | None = None) -> None:
@@ -185,7 +193,7 @@ def _parts(folder: Path) -> list[Path]:
 
 
 def _without_number(header: Header) -> Header:
-    """A shard's header as all shards have it."""
+    """The header of a shard without its number: equal for all shards."""
     return replace(header, meta={key: value for key, value in header.meta.items() if key != SHARD_NUMBER})
 
 
@@ -196,5 +204,5 @@ def _refuse_twice(names: Sequence[object], advice: str) -> None:
 
 
 def _index(shard: EpisodeStore) -> list[IndexEntry]:
-    """The index of a shard; its checksums are not among what a store keeps."""
+    """The index of a shard, read again because a store does not keep its checksums."""
     return read_index(shard.path, shard.header)[0][: shard.num_episodes]

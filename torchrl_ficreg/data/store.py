@@ -1,4 +1,4 @@
-"""Recorded episodes opened for reading: from a dataset directory, or from memory."""
+"""Recorded episodes, opened for reading from a dataset directory or from memory."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from torchrl_ficreg.keys import ACTION, PIXELS, STATE
 
 Verify = Literal["ends", "full", "none"]
 
-# Python names this flag from 3.13 on. Without it Linux refuses a private mapping larger than its memory, because
-# every page of it might be written to; paper-scale datasets are several times larger than memory.
+# Python has this constant since 3.13. Without the flag Linux refuses a private mapping larger than its memory, because
+# every page might be written to; datasets of the size in the paper are several times larger than memory.
 _MAP_NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" else 0)
 
 
@@ -49,24 +49,24 @@ class EpisodeStore:
         start    0             6         10
 
     The arrays of a directory are private mappings: pages are read when touched, and a write stays in this
-    process. Pickling a store of a directory carries its path, not its data, and maps again on arrival.
-    Frames are read with :meth:`frames`, however they are stored.
+    process. A pickled store of a directory contains its path instead of its data, and is mapped again when unpickled.
+    Frames of every format are read with :meth:`frames`.
 
     Args:
-        header: target, row shapes and the user's fields.
-        entries: the committed episodes.
-        arrays: key -> [N, ...] rows. ``None`` maps those of ``path``.
-        path: the directory the arrays are mapped from, or ``None`` for data in memory.
+        header (Header): target, row shapes and the user's fields.
+        entries (list of IndexEntry): the committed episodes.
+        arrays (dict or None): key -> [N, ...] rows. ``None`` maps those of ``path``.
+        path (Path, optional): the directory the arrays are mapped from. Default: ``None``, data in memory.
 
     Keyword Args:
-        num_threads: threads that copy or decode frames. Default: the usable cores, at most eight. What is read does
-            not depend on it.
+        num_threads (int, optional): threads that copy or decode frames; the result does not depend on it. Default: the
+            usable cores, at most eight.
 
     Attributes:
         start: int64 [E], first row of each episode; episode ``e`` is entry ``e - 1``.
         length: int64 [E], rows of each episode.
         arrays: key -> [N, ...] rows; ``pixels`` is among them only when the frames are raw.
-        blob_bytes: of compressed frames, what their images take together.
+        blob_bytes: total size of the images of compressed frames.
         fingerprint: sha256 of the index, and through its checksums of the data; the same for every frame format.
     """
 
@@ -106,7 +106,7 @@ class EpisodeStore:
         return slice(start, start + int(self.length[episode - 1]))
 
     def require_state(self) -> None:
-        """Refuses data without a state, for what needs one.
+        """Checks that the dataset has states.
 
         Raises:
             ValueError: the episodes were converted without a state.
@@ -121,11 +121,11 @@ class EpisodeStore:
         """Reads frames.
 
         Args:
-            rows: row numbers of any shape, or a slice of rows.
+            rows (slice or ndarray): rows, or row numbers of any shape.
 
         Returns:
-            uint8 [*rows.shape, 3, H, W], the caller's to keep and to write to. A slice of raw frames is not copied:
-            what is written into it is seen by later readers of this process, never by the file.
+            uint8 [*rows.shape, 3, H, W], writable. A slice of raw frames is not copied: what is written into it is read
+            by later calls in this process, and never reaches the file.
 
         Raises:
             IndexError: a row beyond the last, or a negative one.
@@ -140,10 +140,13 @@ class EpisodeStore:
         """Opens a dataset directory.
 
         Args:
-            path: the directory.
-            allow_incomplete: accept fewer episodes than the target.
-            verify: whose checksums to compare: the first and last episode's, every episode's, or nobody's.
-            num_threads: threads that copy or decode frames. Default: the usable cores, at most eight.
+            path (Path): the directory.
+
+        Keyword Args:
+            allow_incomplete (bool, optional): accept fewer episodes than the target. Default: ``False``.
+            verify (str, optional): which checksums to compare: ``"ends"``, those of the first and last episode,
+                ``"full"``, all, or ``"none"``. Default: ``"ends"``.
+            num_threads (int, optional): threads that copy or decode frames. Default: the usable cores, at most eight.
 
         Raises:
             FileNotFoundError: there is no dataset at ``path``.
@@ -160,7 +163,7 @@ class EpisodeStore:
         entries, _ = read_index(path, header)
         if not entries or (len(entries) < header.target_episodes and not allow_incomplete):
             hint = COLLECT_HINT.format(env=header.meta.get("env", "<env>"))
-            escape = ", or pass allow_incomplete=True" if entries else ""
+            escape = ", or open it with open_store(path, allow_incomplete=True)" if entries else ""
             got = f"{len(entries)} of {header.target_episodes} episodes"
             raise ValueError(f"{path} holds {got}: {hint}, which continues{escape}.")
         store = cls(header, entries, None, path, num_threads=num_threads)
@@ -173,7 +176,13 @@ class EpisodeStore:
     def from_episodes(
         cls, episodes: Iterable[Mapping[str, np.ndarray]], *, meta: Mapping[str, Any] | None = None
     ) -> EpisodeStore:
-        """Copies episodes into memory, under the same checks as when they are written to disk.
+        """Copies episodes into memory, with the checks of :class:`~torchrl_ficreg.data.EpisodeWriter`.
+
+        Args:
+            episodes (iterable of dict): see :func:`~torchrl_ficreg.data.layout.check_episode`.
+
+        Keyword Args:
+            meta (dict, optional): the user's fields. Default: ``None``, empty.
 
         Raises:
             KeyError, ValueError: an episode breaks the key contract, the row shapes differ, or there is none.
@@ -222,9 +231,9 @@ class EpisodeStore:
             )
 
     def check_files(self) -> None:
-        """Checks that no mapped file has become shorter: reading beyond its end would end the process by SIGBUS.
+        """Checks that no mapped file has become shorter: reading beyond its end would kill the process by SIGBUS.
 
-        Costs some microseconds a file. A file that was removed stays readable through its mapping.
+        It takes some microseconds per file. A file that was removed stays readable through its mapping.
 
         Raises:
             OSError: a file has become shorter.

@@ -34,32 +34,34 @@ from torchrl_ficreg.keys import PIXELS
 
 
 class EpisodeWriter:
-    """Appends episodes to a dataset directory; the process may be killed at any instant.
+    """Appends episodes to a dataset directory, safe against being killed at any instant.
 
-    An episode is *committed* by its index line, which is written only after its rows are on disk::
+    An episode is *committed* by the end of its index line, which is written after its rows are on disk::
 
         index line without its end -> fsync -> rows -> pixels, action, state files -> fsync -> end of the line -> fsync
 
-    A crash therefore loses at most the episode being appended. Opening the directory again cuts every file
-    back to the last committed episode, and :attr:`num_episodes` says where to continue: a collection that
-    derives episode k from ``(seed, k)`` can simply be run again and never repeats or skips one. An episode whose
-    rows are all there and whose line is a part of what belongs there is committed instead.
+    A crash therefore loses at most the episode being appended. Opening the directory again truncates every file to the
+    last committed episode, and :attr:`num_episodes` is where to continue: a collection that derives episode k from
+    ``(seed, k)`` can be run again and never repeats or skips one. An episode whose rows are complete and whose index
+    line is a beginning of the right one is committed instead.
 
-    Nothing is cut before the checksums of committed episodes were compared, and never more than one unfinished
+    Files are truncated only after the checksums of committed episodes were compared, and by no more than one unfinished
     episode. A complete dataset is not opened for writing at all, so it may lie on a read-only file system.
 
     Args:
-        path: directory of the dataset, created when missing.
+        path (str or Path): directory of the dataset, created when missing.
 
     Keyword Args:
-        target_episodes: the number of episodes that makes the dataset complete.
-        meta: whatever reproduces the data (environment, its arguments, image size, seed, expert, action bounds);
-            anything JSON can hold, numpy values included.
-        resume: continue an existing dataset. With ``False`` an existing dataset is an error.
-        wait: let another writer of the same dataset finish first. With ``False`` it is an error.
-        frames: ``"raw"`` stores frames as they are, which is fastest to read. ``"webp"`` and ``"png"`` store one
-            lossless image per frame: what is read back is the same to the bit, and so is the fingerprint.
-        num_threads: frames compressed at a time. Default: the usable cores, at most eight.
+        target_episodes (int): number of episodes at which the dataset is complete.
+        meta (dict): everything that reproduces the data (environment, its arguments, image size, seed, expert, action
+            bounds): values of JSON, numpy values included.
+        resume (bool, optional): continue an existing dataset. With ``False`` an existing dataset is an error.
+            Default: ``True``.
+        wait (bool, optional): wait until another writer of the same dataset has finished. With ``False`` another writer
+            is an error. Default: ``False``.
+        frames (str, optional): ``"raw"`` is fastest to read. ``"webp"`` and ``"png"`` store one lossless image per frame,
+            with the same frames and the same fingerprint. Default: ``"raw"``.
+        num_threads (int, optional): frames compressed at a time. Default: the usable cores, at most eight.
 
     Raises:
         FileExistsError: the dataset exists and ``resume`` is false.
@@ -147,7 +149,7 @@ class EpisodeWriter:
         """Writes and commits one episode.
 
         Args:
-            episode: see :func:`~torchrl_ficreg.data.layout.check_episode`; row shapes as in the first episode.
+            episode (dict): see :func:`~torchrl_ficreg.data.layout.check_episode`; row shapes as in the first episode.
 
         Returns:
             The id of the episode, from 1.
@@ -170,7 +172,7 @@ class EpisodeWriter:
         entry = IndexEntry(self.num_episodes + 1, self.num_steps, length, *checksums(episode))
         line, (content, blob_bytes) = entry.to_line(), self._to_files(episode)
         try:
-            write_all(self._index, line.removesuffix(b"\n"))  # tells the next opening how much a crash may leave behind
+            write_all(self._index, line.removesuffix(b"\n"))  # from it the next opening knows how much a crash may have left
             os.fsync(self._index)
             for name, rows in content.items():
                 write_all(self._files[name], rows)
@@ -179,8 +181,7 @@ class EpisodeWriter:
             write_all(self._index, b"\n")
             os.fsync(self._index)
         except BaseException as error:
-            # Cutting files back needs no space, so this also holds on a full disk. If even that fails, the
-            # next opening does it.
+            # Truncating needs no space, so it also works on a full disk. If it fails, the next opening does it.
             self._truncate()
             if isinstance(error, OSError) and error.filename is None:
                 raise OSError(
@@ -196,7 +197,7 @@ class EpisodeWriter:
         return entry.episode
 
     def finish(self) -> None:
-        """Closes the writer and vouches that the dataset is complete.
+        """Closes the writer and checks that the dataset is complete.
 
         Raises:
             RuntimeError: fewer episodes than the target were committed.
@@ -207,7 +208,7 @@ class EpisodeWriter:
             raise RuntimeError(f"{self.path} holds {got}: append the rest before finish(), or leave with close().")
 
     def close(self) -> None:
-        """Releases the files and the lock. What was appended is already on disk. Idempotent."""
+        """Releases the files and the lock. Appended episodes are already on disk. Idempotent."""
         descriptors = [*self._files.values(), *([self._index] if self._index >= 0 else [])]
         self._files, self._index = {}, -1
         for descriptor in descriptors:
@@ -220,7 +221,7 @@ class EpisodeWriter:
         self.close()
 
     def _to_files(self, episode: dict[str, np.ndarray]) -> tuple[dict[str, Any], int]:
-        """What to append to each data file, and how long the file of images is then."""
+        """The bytes to append to each data file, and the resulting size of the file of images."""
         content: dict[str, Any] = {
             f"{key}.memmap": np.ascontiguousarray(episode[key], dtype)
             for key, dtype in DTYPES.items()
@@ -233,7 +234,7 @@ class EpisodeWriter:
         return {BLOB: b"".join(images), OFFSETS: ends.astype(OFFSET_DTYPE), **content}, int(ends[-1])
 
     def _begin(self, shapes: dict[str, tuple[int, ...]]) -> None:
-        # meta.json comes last: a directory that has one has all its files.
+        # meta.json is written last: a directory with one has all its files.
         header = Header(self.target_episodes, shapes, self.meta, self.frames)
         self._open_data(header)
         self._truncate()
@@ -241,7 +242,7 @@ class EpisodeWriter:
         self._header = header
 
     def _read(self) -> tuple[Header, list[IndexEntry]]:
-        """Header and index of what is there, compared with what is wanted; nothing is opened for writing."""
+        """Header and index of the existing dataset, compared with the arguments; nothing is opened for writing."""
         header = read_header(self.path)
         lost = [name for name in (INDEX_FILE, *header.files) if not os.path.lexists(self.path / name)]
         if lost:
@@ -260,7 +261,7 @@ class EpisodeWriter:
         return store
 
     def _resume(self) -> None:
-        header, entries = self._read()  # once more, now that nobody else writes
+        header, entries = self._read()  # again, under the lock
         if entries:
             store = self._verified(header, entries)
             if header.frames != "raw":
@@ -281,15 +282,15 @@ class EpisodeWriter:
             write_header(self.path, self._header)
 
     def _check_excess(self, entries: list[IndexEntry]) -> None:
-        """Refuses to cut off more than one unfinished episode: then header or index, not the data, are damaged.
+        """Refuses to truncate more than one unfinished episode: then the header or the index is damaged, not the data.
 
         Raises:
-            ValueError: there is more behind the last committed episode.
+            ValueError: a file holds more behind the last committed episode.
         """
         if not entries and min(self._rows_behind()) < 2:  # not even one episode is whole
             return
         most = self._unfinished_rows(entries)
-        image = self._header.row_bytes(PIXELS) + 1024  # lossless images are hardly larger than what they hold
+        image = self._header.row_bytes(PIXELS) + 1024  # a lossless image is hardly larger than its raw frame
         for name, committed in self._sizes().items():
             row = image if name == BLOB else self._row_bytes(name)
             excess = (self.path / name).stat().st_size - committed
@@ -300,12 +301,12 @@ class EpisodeWriter:
                 )
 
     def _episode_of_torn_line(self, entries: list[IndexEntry]) -> IndexEntry | None:
-        """The episode after the committed ones, where all its rows are there and a part of its index line.
+        """The episode after the committed ones, if all its rows and a part of its index line are there.
 
-        A crash leaves a whole line before the first row: a torn one with all rows is damage, which the rows can mend.
+        A crash leaves a whole line before the first row: a torn line with all rows is damage, which the rows can repair.
 
         Raises:
-            ValueError: a torn line that is no part of what the rows ask for.
+            ValueError: the torn line does not belong to the rows.
         """
         torn, behind = read_bytes(self.path / INDEX_FILE)[self._index_bytes :], self._rows_behind()
         rows = int(min(behind))
@@ -315,7 +316,7 @@ class EpisodeWriter:
         try:
             store = EpisodeStore(self._header, [*entries, entry], None, self.path, num_threads=self.num_threads)
             crc, pixels_crc = checksums(store.stored(entry))
-        except ValueError:  # images that are none
+        except ValueError:  # images that cannot be decoded
             return None
         line = entry._replace(crc=crc, pixels_crc=pixels_crc).to_line()
         if line.startswith(torn):
@@ -328,7 +329,7 @@ class EpisodeWriter:
         return None
 
     def _rows_behind(self) -> set[float]:
-        """How many rows each data file holds behind the last committed episode."""
+        """The number of rows behind the last committed episode, of each data file."""
         sizes = {name: committed for name, committed in self._sizes().items() if name != BLOB and self._row_bytes(name)}
         return {((self.path / name).stat().st_size - sizes[name]) / self._row_bytes(name) for name in sizes}
 
@@ -336,7 +337,7 @@ class EpisodeWriter:
         return OFFSET_DTYPE.itemsize if name == OFFSETS else self._header.row_bytes(name.split(".")[0])
 
     def _unfinished_rows(self, entries: list[IndexEntry]) -> int:
-        """The most rows that one unfinished episode can have left behind."""
+        """The largest number of rows that one unfinished episode can have left."""
         begun = read_bytes(self.path / INDEX_FILE)[self._index_bytes :]
         try:
             return int(json.loads(begun)["length"])
@@ -383,10 +384,10 @@ class EpisodeWriter:
         return {BLOB: self._blob_bytes, OFFSETS: self.num_steps * OFFSET_DTYPE.itemsize, **rows}
 
     def _truncate(self) -> None:
-        """Cuts the data, then the index, back to the last committed episode.
+        """Truncates the data, then the index, to the last committed episode.
 
-        The unfinished line of the index says how much a crash left behind, so it goes last; its end, if it has one
-        already, goes first.
+        The unfinished line of the index says how many rows a crash left, so it is removed last; its newline, if it has
+        one already, is removed first.
         """
         end = os.fstat(self._index).st_size
         if end > self._index_bytes:
@@ -400,7 +401,7 @@ class EpisodeWriter:
 
 
 def _to_builtin(value: Any) -> Any:
-    """JSON form of numpy arrays, numpy scalars and paths."""
+    """Numpy arrays, numpy scalars and paths as values of JSON."""
     if isinstance(value, (np.ndarray, np.generic)):
         return value.tolist()
     if isinstance(value, Path):

@@ -110,7 +110,7 @@ def test_a_shifted_file_is_refused_and_repaired(tmp_path, make_rows, expected, l
     for start, stop in zip(stops - rows["ep_len"], stops):
         rows["action"][start:stop] = np.roll(rows["action"][start:stop], -lag, axis=0)
     path = write_lewm(tmp_path / "shifted.h5", rows)
-    with pytest.raises(ValueError, match=rf"the lag is \{lag:+d} .*repair it by shift={lag}"):
+    with pytest.raises(ValueError, match=rf"the lag is \{lag:+d} .*correct it by shift={lag}"):
         convert(path, tmp_path / "refused", progress=False)
     assert not (tmp_path / "refused").exists()
     with open_source(path, shift=lag) as source:
@@ -127,7 +127,7 @@ def test_a_file_of_actions_that_explain_nothing_passes_with_a_warning(tmp_path, 
     rows = make_rows([100, 100])
     rows["state"] = np.random.default_rng(1).normal(size=rows["state"].shape)
     path = write_lewm(tmp_path / "x.h5", rows)
-    with pytest.warns(UserWarning, match="no lag explains more than 10%.*named by state="):
+    with pytest.warns(UserWarning, match="no lag explains more than 10%.*by state="):
         convert(path, tmp_path / "a", progress=False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -1,4 +1,4 @@
-"""Episodes of other projects, turned into datasets of this one."""
+"""Converters from other dataset formats: HDF5, Lance, LeRobot, OGBench and arrays in memory."""
 
 from __future__ import annotations
 

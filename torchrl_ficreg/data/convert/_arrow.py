@@ -1,25 +1,35 @@
-"""Columns of Arrow tables, as Lance and Parquet files hold them, turned into arrays."""
+"""Arrow columns, as Lance and Parquet files hold them, converted to arrays."""
 
 from __future__ import annotations
 
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from torchrl_ficreg._utils import require
 from torchrl_ficreg.data.convert.images import decode
-from torchrl_ficreg.data.convert.table import Column, require
-
+from torchrl_ficreg.data.convert.table import Column
 
 _MOST_ROW_BYTES = 64 * 2**20  # of one row; a small file can declare lists that fill the memory
 
 
+def require_arrow(module: str) -> ModuleType:
+    """Imports a module of pyarrow, which is installed with pylance.
+
+    Raises:
+        ImportError: it is missing.
+    """
+    return require(module, "data", purpose="this format", package="pylance")
+
+
 def describe(kind: Any, cell: Any, rows: int) -> Column | str:
-    """Says what an Arrow column holds, or why it cannot be read.
+    """Describes an Arrow column, or says why it cannot be read.
 
     Args:
-        kind: its ``pyarrow.DataType``.
-        cell: its first value, a Python object.
-        rows: how many there are.
+        kind (pyarrow.DataType): its type.
+        cell (object): its first value.
+        rows (int): its number of rows.
     """
     picture = picture_bytes(cell)
     if picture is not None:
@@ -27,7 +37,7 @@ def describe(kind: Any, cell: Any, rows: int) -> Column | str:
             return Column(decode([picture]).shape[1:], "image", rows)
         except ValueError as error:
             return f"holds no frames: {error}"
-    types = require("pyarrow", "pylance").types
+    types = require_arrow("pyarrow").types
     shape: list[int] = []
     while isinstance(cell, list):
         shape.append(len(cell))
@@ -40,10 +50,10 @@ def first_cells(head: Any) -> dict[str, Any]:
     """The first value of every column, as Python objects; empty where there is no row.
 
     Args:
-        head: at most one row, a ``RecordBatch`` or ``Table``.
+        head (pyarrow.RecordBatch or pyarrow.Table): at most one row.
 
     Raises:
-        ValueError: the row is too large for that: as objects, numbers take eight times their size.
+        ValueError: the row is too large: as Python objects numbers take eight times their size.
     """
     if head is None or not len(head):
         return {}
@@ -53,14 +63,14 @@ def first_cells(head: Any) -> dict[str, Any]:
 
 
 def picture_bytes(cell: Any) -> bytes | None:
-    """The encoded picture in a cell: bytes, or a dictionary that holds them, as ``datasets`` writes it."""
+    """The encoded picture in a cell: bytes, or a dictionary that holds them, as Hugging Face ``datasets`` writes them."""
     if isinstance(cell, dict):
         cell = cell.get("bytes")
     return cell if isinstance(cell, bytes) else None
 
 
 def split(columns: dict[str, Column | str]) -> tuple[dict[str, Column], dict[str, str]]:
-    """The columns that can be read, and why others cannot."""
+    """Divides what :func:`describe` returned into the columns that can be read and the reasons why others cannot."""
     readable = {name: column for name, column in columns.items() if isinstance(column, Column)}
     return readable, {name: reason for name, reason in columns.items() if isinstance(reason, str)}
 
@@ -69,9 +79,9 @@ def to_array(values: Any, column: Column, first_row: int = 0) -> np.ndarray:
     """Turns a ``ChunkedArray`` into an array.
 
     Args:
-        values: L values of a column.
-        column: what :func:`describe` said of it.
-        first_row: row of the first value, for messages. Default: 0.
+        values (pyarrow.ChunkedArray): L values of a column.
+        column (Column): its description by :func:`describe`.
+        first_row (int, optional): row of the first value, for messages. Default: ``0``.
 
     Returns:
         [L, *shape].
@@ -87,7 +97,7 @@ def to_array(values: Any, column: Column, first_row: int = 0) -> np.ndarray:
             raise ValueError("a frame holds no bytes: it refers to a file outside the table")
         return decode(cells, column.shape, first_row=first_row)
     flat = values.combine_chunks()
-    compute = require("pyarrow.compute", "pylance")
+    compute = require_arrow("pyarrow.compute")
     for width in column.shape:
         # Compared one by one: a short list and a long one may add up to the right number of values.
         widths = compute.unique(compute.list_value_length(flat)).to_pylist()

@@ -1,4 +1,4 @@
-"""Do the actions of a file lead from the row they stand in? Measured, because nothing else can tell."""
+"""Measures in which row a file stores its actions: the row they lead from, or a neighbouring one."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 LAGS = (-1, 0, 1)
 
-# Of the variance of the state's change: less than this is what the actions of another environment explain.
+# Fraction of the variance of the state's change. Actions of an unrelated environment explain less than this.
 EXPLAINED = 0.1
 
 # Another lag is better when it explains this much more ...
 _MARGIN = 0.1
-# ... or leaves less than this part unexplained. Slow actions fit nearly as well one row off: 0.999 against 0.97.
+# ... or leaves less than this fraction unexplained. Slow actions fit nearly as well one row off: 0.999 against 0.97.
 _REMAINDER = 0.5
 
 
@@ -22,11 +22,11 @@ class Alignment(NamedTuple):
     """How well the actions explain the change of the state, at each lag.
 
     Attributes:
-        r2: lag -> explained share of the variance, at most 1. Lag k pairs the action of row t with the change from
-            row t + k to row t + k + 1: 0 is right, -1 says that an action is stored in the row it leads to.
+        r2: lag -> explained fraction of the variance, at most 1. Lag k pairs the action of row t with the change from
+            row t + k to row t + k + 1: 0 is right, -1 means that an action is stored in the row it leads to.
         change: what was explained: the ``"difference"`` of the state, the ``"second difference"``, where actions are
-            forces and the state holds no velocity, or the ``"target"``, where they are positions to be reached.
-        rows: how many rows entered.
+            forces and the state has no velocity, or the ``"target"``, where they are positions to be reached.
+        rows: number of rows in the fit.
     """
 
     r2: dict[int, float]
@@ -35,7 +35,7 @@ class Alignment(NamedTuple):
 
     @property
     def lag(self) -> int | None:
-        """The lag at which the actions stand, or ``None`` where no lag explains anything.
+        """The lag at which the actions are stored, or ``None`` where no lag explains anything.
 
         It is 0 unless another one is clearly better.
         """
@@ -55,15 +55,15 @@ def measure_alignment(episodes: Iterable[tuple[np.ndarray, np.ndarray]]) -> Alig
 
         s[t+k+1] - s[t+k]  ~  W a[t] + b        k = -1, 0, 1
 
-    Every lag is fitted to its own rows; of the state, the A components count that actions explain best. Where no lag
-    explains a tenth of their variance, second differences are tried, which is what a force changes, and then
-    s[t+k+1] ~ W a[t] + V s[t+k] + b against V alone, for actions that are positions to be reached.
+    Every lag is fitted to its own rows, and the result is the mean over the A state components that the actions explain
+    best. Where no lag explains a tenth of their variance, second differences are tried, which is what a force changes,
+    and then s[t+k+1] ~ W a[t] + V s[t+k] + b against V alone, for actions that are positions to be reached.
 
     Args:
-        episodes: pairs of action [L, A] and state [L, S]. Rows with a NaN are left out.
+        episodes (iterable): pairs of action [L, A] and state [L, S]. Rows with a NaN are left out.
 
     Returns:
-        the first of the three that explains something; otherwise plain differences.
+        the first of the three fits that explains something; otherwise that of plain differences.
 
     Examples:
         >>> rng = np.random.default_rng(0)
@@ -95,8 +95,7 @@ def _fit(episodes: list[tuple[np.ndarray, np.ndarray]], change: str) -> Alignmen
         base = _residual(known, changed)
         left = _residual(np.concatenate([known, given], 1), changed)
         with np.errstate(divide="ignore", invalid="ignore"):
-            # A component that does not change has nothing to explain; one whose squares overflow, or that has too few
-            # rows, tells nothing.
+            # Zero for a component that does not change, whose squares overflow or that has too few rows.
             share = np.where(base > 1e-12 * (1 + (changed**2).sum(0)), 1 - left / base, 0.0)
             per_lag[lag] = np.where(np.isfinite(share), share, 0.0)
     width = min(episodes[0][0].shape[1], episodes[0][1].shape[1])
@@ -105,7 +104,7 @@ def _fit(episodes: list[tuple[np.ndarray, np.ndarray]], change: str) -> Alignmen
 
 
 def _pairs(action: np.ndarray, state: np.ndarray, lag: int, change: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Actions [n, A], what is known besides [n, K] and the change to explain [n, S], of one episode at one lag."""
+    """Actions [n, A], other known inputs [n, K] and the change to explain [n, S], of one episode at one lag."""
     if change == "second difference":
         changed, known = state[2:] - 2 * state[1:-1] + state[:-2], np.zeros((max(len(state) - 2, 0), 0))
         first = 1  # row of the change's start
@@ -113,8 +112,8 @@ def _pairs(action: np.ndarray, state: np.ndarray, lag: int, change: str) -> tupl
         changed = np.diff(state, axis=0)
         known = state[:-1] if change == "target" else np.zeros((len(changed), 0))
         first = 0
-    # Row t's action goes with the change that starts in row t + lag, the (t + lag - first)-th there is. The last
-    # action leads nowhere; where it is a number, it must not count.
+    # The action of row t belongs to the change that starts in row t + lag, which has index t + lag - first. The last
+    # action leads nowhere and must not count, even where it is a number.
     rows = np.arange(len(action) - 1)
     place = rows + lag - first
     inside = (place >= 0) & (place < len(changed))
@@ -124,7 +123,7 @@ def _pairs(action: np.ndarray, state: np.ndarray, lag: int, change: str) -> tupl
 
 
 def _residual(inputs: np.ndarray, outputs: np.ndarray) -> np.ndarray:
-    """Sum of squares [S] that a ridge regression leaves, corrected for its number of inputs."""
+    """Residual sum of squares [S] of a ridge regression, corrected for its number of inputs."""
     count = len(outputs)
     freedom = count - inputs.shape[1] - 1
     if freedom < 1:

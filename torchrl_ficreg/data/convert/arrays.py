@@ -1,4 +1,4 @@
-"""Arrays of one's own: in memory, memory-mapped, or anything else that can be sliced."""
+"""Episodes in the user's own arrays: in memory, memory-mapped, or anything else that can be sliced."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class ArrayTable(Table):
     """Arrays over all rows, one after another; sliced when read.
 
     Args:
-        arrays: name -> [N, ...].
-        lengths: int64 [E], rows of each episode.
+        arrays (dict): name -> [N, ...].
+        lengths (sequence of int): [E], rows of each episode.
 
     Raises:
         ValueError: the arrays differ in their number of rows, or the lengths do not add up to it.
@@ -54,28 +54,25 @@ def from_arrays(
     state: Any = None,
     lengths: Sequence[int] | np.ndarray | None = None,
     episode_ends: Sequence[int] | np.ndarray | None = None,
-    env: str | None = None,
-    shift: int = 0,
-    skip_bad_episodes: bool = False,
+    **source: Any,
 ) -> EpisodeSource:
-    """Episodes in arrays of one's own.
+    """Episodes in the user's own arrays.
 
-    Row t holds the frame, the state it was drawn from, and the action that leads to row t + 1. What the last row of
-    an episode has as its action is not used.
+    Row t holds the frame, the state it was drawn from, and the action that leads to row t + 1. The action in the last
+    row of an episode is not used.
 
     Keyword Args:
-        pixels: [N, H, W, 3] or [N, 3, H, W] uint8. This and the others may be numpy arrays, ``np.memmap``, torch
-            tensors, lists, or datasets of h5py or zarr: anything with ``shape``, ``dtype`` and slices.
-        action: [N, A].
-        state: [N, S]. Default: none. No loss reads it; alignment is not verified and no pairs are drawn without it.
-        lengths: [E], rows of each episode.
-        episode_ends: [E], one past the last row of each episode; instead of ``lengths``.
-        env: name of the environment, for the record.
-        shift: see :class:`EpisodeSource`.
-        skip_bad_episodes: see :meth:`EpisodeSource.leave_out_bad_episodes`. Default: ``False``.
+        pixels (array): [N, H, W, 3] or [N, 3, H, W] uint8. This and the others may be numpy arrays, ``np.memmap``,
+            torch tensors, lists, or datasets of h5py or zarr: anything with ``shape``, ``dtype`` and slices.
+        action (array): [N, A].
+        state (array, optional): [N, S]. No loss reads it, but without it alignment cannot be verified and no
+            start-goal pairs can be drawn. Default: ``None``.
+        lengths (sequence of int, optional): [E], rows of each episode.
+        episode_ends (sequence of int, optional): [E], one past the last row of each episode; instead of ``lengths``.
+        **source: ``env``, ``shift`` and ``skip_bad_episodes`` of :class:`EpisodeSource`.
 
     Returns:
-        What :func:`convert` takes.
+        the episodes, for :func:`convert`.
 
     Raises:
         ValueError: lengths that do not fit, wrong shapes or dtypes, or not exactly one of ``lengths`` and
@@ -109,17 +106,15 @@ def from_arrays(
         lengths = np.diff(_whole_numbers(episode_ends, "episode_ends"), prepend=0)
     return EpisodeSource(
         ArrayTable(arrays, lengths),
-        env=env,
         state=["state"] if state is not None else None,
         pixels="pixels",
         action="action",
-        shift=shift,
-        skip_bad_episodes=skip_bad_episodes,
+        **source,
     )
 
 
 def _as_array(value: Any, name: str) -> Any:
-    """Something with ``shape``, ``dtype`` and slices, without a copy where that can be.
+    """Converts to something with ``shape``, ``dtype`` and slices, without a copy where possible.
 
     Raises:
         TypeError: it holds no numbers.

@@ -1,10 +1,11 @@
-"""From a foreign file to a dataset of ours, episode by episode."""
+"""Conversion of a source file to a dataset, episode by episode."""
 
 from __future__ import annotations
 
 import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from torchrl_ficreg.data.writer import EpisodeWriter
 from torchrl_ficreg.keys import PIXELS
 
 _SAMPLED_EPISODES = 50
-_ROWS_PER_NUMBER = 20  # fewer rows per component of an action are no basis for a verdict
+_ROWS_PER_NUMBER = 20  # fewer rows per action component do not suffice for the fit
 
 
 def convert(
@@ -39,30 +40,31 @@ def convert(
     skip_bad_episodes: bool = False,
     progress: bool = True,
 ) -> Path:
-    """Turns somebody else's data into a dataset of this package.
+    """Converts data of another format to a dataset of this package.
 
-    One episode at a time is in memory. Killed and called again with the same arguments it continues, and ends in the
-    same bytes. Before the first byte is written the alignment of actions and states is verified and the disk looked
-    at.
+    One episode at a time is in memory. A conversion that was killed continues when it is called again with the same
+    arguments, with the same bytes as a result. The alignment of actions and states and the free disk space are checked
+    before anything is written.
 
     Args:
-        source: a file or folder, opened by :func:`open_source`, or an :class:`EpisodeSource`.
-        target: directory of the dataset.
+        source (str, Path or EpisodeSource): a file or folder, opened by :func:`open_source`, or an opened source.
+        target (str or Path): directory of the dataset.
 
     Keyword Args:
-        env: ``two_room``, ``push_t``, ``reacher``, ``cube``, or a name of your own for other data. Default: the
-            source's.
-        env_kwargs: noted in the dataset: how the environment has to be built that these data came from.
-        action_bounds: lowest and highest action, two vectors [A], noted for planning. Default: -1 and 1 for the four
-            environments; otherwise the smallest and largest action in the file.
-        frames: how they are stored: ``"raw"``, or compressed one by one as ``"webp"`` or ``"png"``.
-        image_size: pixels of a side to which frames are scaled; frames that are not square are squeezed, with a
-            warning. Default: as they are.
-        limit: at most so many episodes, from the first.
-        check_alignment: refuse a file whose actions stand in other rows than they should.
-        skip_bad_episodes: leave out the episodes that are damaged, or hold a NaN or an infinity, and say how many. Reads
-            the data twice. Default: ``False``.
-        progress: show a bar with frames per second and the time left.
+        env (str, optional): ``"two_room"``, ``"push_t"``, ``"reacher"``, ``"cube"``, or any name for other data.
+            Default: that of the source.
+        env_kwargs (dict, optional): arguments of the environment that the data came from, stored with the dataset.
+            Default: ``None``, none.
+        action_bounds (pair of sequences, optional): lowest and highest action, two vectors [A], stored for planning.
+            Default: -1 and 1 for the four environments; otherwise the smallest and largest action in the file.
+        frames (str, optional): ``"raw"``, or compressed one by one as ``"webp"`` or ``"png"``. Default: ``"raw"``.
+        image_size (int, optional): pixels of a side to which frames are scaled; frames that are not square are
+            squeezed, with a warning. Default: ``None``, as they are.
+        limit (int, optional): largest number of episodes, from the first. Default: ``None``, all.
+        check_alignment (bool, optional): refuse a file whose actions are stored in the wrong rows. Default: ``True``.
+        skip_bad_episodes (bool, optional): leave out the episodes that are damaged, or hold a NaN or an infinity, and
+            warn with their number. Reads the data twice. Default: ``False``.
+        progress (bool, optional): show a bar with frames per second and the remaining time. Default: ``True``.
 
     Returns:
         the directory.
@@ -91,59 +93,49 @@ def convert(
         ...     dataset.sample()["pixels"].shape, dataset.meta["source"]["format"]
         (torch.Size([4, 4, 3, 8, 8]), 'arrays')
     """
-    if not isinstance(source, EpisodeSource):
-        with open_source(source, env=env, skip_bad_episodes=skip_bad_episodes) as opened:
-            return convert(
-                opened,
-                target,
-                env_kwargs=env_kwargs,
-                action_bounds=action_bounds,
-                frames=frames,
-                image_size=image_size,
-                limit=limit,
-                check_alignment=check_alignment,
-                progress=progress,
-            )
-    _check_arguments(source, env, frames, image_size, limit)
-    if skip_bad_episodes:
-        source.leave_out_bad_episodes()
-    place = Path(target).expanduser()
-    if place.exists() and not place.is_dir():
-        raise ValueError(f"target={target} is a file: name a folder.")
-    size = (int(image_size), int(image_size)) if image_size else source.frame_shape
-    count = min(limit or len(source), len(source))
-    if source.skipped:
-        warnings.warn(f"{source.table.path}: {source.skipped} episodes of fewer than two rows are left out.")
-    for notice in source.notices:
-        warnings.warn(f"{source.table.path}: {notice}.")
-    _tell_shape(source, size)
-    if check_alignment and source.state_dim:
-        verify_alignment(source)
-    low, high = _bounds(source, action_bounds)
-    meta = {
-        "env": env or source.env or "unknown",
-        "env_kwargs": dict(env_kwargs or {}),
-        "image_size": size[0] if size[0] == size[1] else list(size),
-        "action_low": low,
-        "action_high": high,
-        "source": source.facts(),
-    }
-    meta = json.loads(json.dumps(meta, sort_keys=True))  # the order in which it comes back when resuming
-    if not (place / META_FILE).exists():  # before the folder is made
-        require_space(target, _needed_bytes(source, int(source.lengths[:count].sum()), size, frames))
-    with EpisodeWriter(target, target_episodes=count, meta=meta, frames=frames) as writer:
-        if not writer.complete:
-            if writer.num_episodes:
-                rest = source.lengths[writer.num_episodes : count]
-                require_space(target, _needed_bytes(source, int(rest.sum()), size, frames))
-            for episode in _episodes(source, writer.num_episodes, count, size, progress):
-                writer.append(episode)
-        writer.finish()
-    return writer.path
+    with ExitStack() as opened:
+        if not isinstance(source, EpisodeSource):
+            source = opened.enter_context(open_source(source, env=env))
+        _check_arguments(source, env, frames, image_size, limit)
+        if skip_bad_episodes:
+            source.leave_out_bad_episodes()
+        place = Path(target).expanduser()
+        if place.exists() and not place.is_dir():
+            raise ValueError(f"target={target} is a file: name a folder.")
+        size = (int(image_size), int(image_size)) if image_size else source.frame_shape
+        count = min(limit or len(source), len(source))
+        if source.skipped:
+            warnings.warn(f"{source.table.path}: {source.skipped} episodes of fewer than two rows are left out.")
+        for notice in source.notices:
+            warnings.warn(f"{source.table.path}: {notice}.")
+        _warn_of_shape(source, size)
+        if check_alignment and source.state_dim:
+            verify_alignment(source)
+        low, high = _bounds(source, action_bounds)
+        meta = {
+            "env": env or source.env or "unknown",
+            "env_kwargs": dict(env_kwargs or {}),
+            "image_size": size[0] if size[0] == size[1] else list(size),
+            "action_low": low,
+            "action_high": high,
+            "source": source.facts(),
+        }
+        meta = json.loads(json.dumps(meta, sort_keys=True))  # as it is read back when resuming
+        if not (place / META_FILE).exists():  # before the folder is made
+            require_space(target, _needed_bytes(source, int(source.lengths[:count].sum()), size, frames))
+        with EpisodeWriter(target, target_episodes=count, meta=meta, frames=frames) as writer:
+            if not writer.complete:
+                if writer.num_episodes:
+                    rest = source.lengths[writer.num_episodes : count]
+                    require_space(target, _needed_bytes(source, int(rest.sum()), size, frames))
+                for episode in _episodes(source, writer.num_episodes, count, size, progress):
+                    writer.append(episode)
+            writer.finish()
+        return writer.path
 
 
-def _tell_shape(source: EpisodeSource, size: tuple[int, int]) -> None:
-    """Says what becomes of frames that are not square: the encoders of this package take square ones."""
+def _warn_of_shape(source: EpisodeSource, size: tuple[int, int]) -> None:
+    """Warns of frames that are not square: the encoders of this package take square ones."""
     height, width = source.frame_shape
     if size[0] != size[1]:
         warnings.warn(
@@ -155,13 +147,13 @@ def _tell_shape(source: EpisodeSource, size: tuple[int, int]) -> None:
 
 
 def verify_alignment(source: EpisodeSource) -> Alignment | None:
-    """Refuses a source whose actions stand in other rows than they should.
+    """Refuses a source whose actions are stored in the wrong rows.
 
     Args:
-        source: the episodes; up to 50 of them, evenly spread, are looked at.
+        source (EpisodeSource): the episodes; the fit uses up to 50 of them, evenly distributed.
 
     Returns:
-        what was measured, or ``None`` where there are too few rows to tell, or no state.
+        the measured alignment, or ``None`` where there are too few rows or no state.
 
     Raises:
         ValueError: another lag than 0 explains the change of the state clearly better.
@@ -176,22 +168,22 @@ def verify_alignment(source: EpisodeSource) -> Alignment | None:
         return None
     found = measure_alignment(source.vectors(int(index)) for index in chosen)
     shares = ", ".join(f"{share:.3f} at lag {lag:+d}" for lag, share in found.r2.items())
-    told = f"actions explain of the change ({found.change}) of the state: {shares}"
+    explained = f"actions explain of the change ({found.change}) of the state: {shares}"
     names = f"{source.table.path}, {' + '.join(source.columns['action'])} and {' + '.join(source.columns['state'])}"
     if found.lag is None:
         warnings.warn(
-            f"{names}: no lag explains more than {EXPLAINED:.0%} ({told}), so the alignment could not be verified. "
-            "Columns that the actions move directly, named by state=, would tell."
+            f"{names}: no lag explains more than {EXPLAINED:.0%} ({explained}), so the alignment could not be verified. "
+            "Name columns that the actions move directly by state=."
         )
     elif found.lag and (found.change == "difference" or found.lag < 0):
         raise ValueError(
-            f"{names} are shifted: the lag is {found.lag:+d} ({told}). Row t has to hold the action that leads from "
-            f"row t to row t + 1: repair it by shift={source.shift + found.lag}, or, if you know better, pass "
+            f"{names} are shifted: the lag is {found.lag:+d} ({explained}). Row t has to hold the action that leads from "
+            f"row t to row t + 1: correct it by shift={source.shift + found.lag}, or, if you are sure, pass "
             "check_alignment=False."
         )
     elif found.lag:
-        # A force, or a position to be reached, may truly act one step late.
-        warnings.warn(f"{names}: actions seem to act one row late ({told}); if they are shifted, pass shift=1.")
+        # A force, or a position to be reached, may act one step late without any shift.
+        warnings.warn(f"{names}: actions seem to act one row late ({explained}): if they are shifted, pass shift=1.")
     return found
 
 
@@ -220,9 +212,9 @@ def _bounds(
         low, high = -np.ones(source.action_dim), np.ones(source.action_dim)
     else:
         low, high = np.full(source.action_dim, np.inf), np.full(source.action_dim, -np.inf)
-        for index in range(len(source)):  # of the whole file, so that a larger limit changes nothing
+        for index in range(len(source)):  # of all episodes, so that a larger limit changes nothing
             action = source.vectors(index)[0][:-1]
-            finite = np.where(np.isfinite(action), action, np.nan)  # what is not is refused when it is read
+            finite = np.where(np.isfinite(action), action, np.nan)  # others are refused when they are read
             low, high = np.fmin(low, np.fmin.reduce(finite)), np.fmax(high, np.fmax.reduce(finite))
         if not (low <= high).all():
             wrong = int(np.flatnonzero(~(low <= high))[0])
@@ -231,9 +223,9 @@ def _bounds(
 
 
 def _needed_bytes(source: EpisodeSource, rows: int, size: tuple[int, int], frames: FrameFormat) -> int:
-    """Disk space of the rows still to come; for compressed frames, a quarter more than a sample says.
+    """Disk space of the remaining rows, in bytes; for compressed frames a quarter above that of a sample.
 
-    The estimate for drawings would be far too low for frames that went through JPEG.
+    :func:`estimate_bytes` alone would be far too low for frames that went through JPEG.
     """
     if frames == "raw":
         return estimate_bytes(rows, size, source.action_dim, source.state_dim)

@@ -1,14 +1,15 @@
-"""Which format is it? One door for all of them."""
+"""Format detection, and :func:`open_source` for files of every format."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from torchrl_ficreg.data.convert.hdf5 import HDF5Table
 from torchrl_ficreg.data.convert.lance import LanceTable
 from torchrl_ficreg.data.convert.lerobot import INFO, LeRobotTable
-from torchrl_ficreg.data.convert.ogbench import NpzTable
+from torchrl_ficreg.data.convert.ogbench import OGBenchTable
 from torchrl_ficreg.data.convert.source import EpisodeSource
 from torchrl_ficreg.data.convert.table import reading, some, Table
 from torchrl_ficreg.data.layout import META_FILE
@@ -16,7 +17,7 @@ from torchrl_ficreg.data.layout import META_FILE
 FORMATS: dict[str, Callable[[Path], Table]] = {
     "hdf5": HDF5Table,
     "lance": LanceTable,
-    "ogbench": NpzTable,
+    "ogbench": OGBenchTable,
     "lerobot": LeRobotTable,
 }
 
@@ -28,10 +29,10 @@ _PACKED = (".zst", ".gz", ".tar", ".zip", ".xz")
 
 
 def detect_format(path: str | Path) -> str:
-    """Says which of the formats a file or folder has, from its first bytes or its contents.
+    """Detects the format of a file or folder, from its first bytes or its contents.
 
     Args:
-        path: the file or folder.
+        path (str or Path): the file or folder.
 
     Returns:
         a key of :data:`FORMATS`.
@@ -58,7 +59,7 @@ def detect_format(path: str | Path) -> str:
     if head[:4] == b"PK\x03\x04" and path.suffix != ".zip":
         return "ogbench"
     if path.suffix in _PACKED:
-        raise ValueError(f"{path} is packed: unpack it first (for .tar.zst: tar --zstd -xf {path.name}).")
+        raise ValueError(f"{path} is compressed: unpack it first (for .tar.zst: tar --zstd -xf {path.name}).")
     if head[:7] == b"version":
         raise ValueError(f"{path} is a pointer to a large file, not the file: fetch it with git lfs pull.")
     raise ValueError(f"{path} has no known format; {_KNOWN}: name it by format= if it is one of them.")
@@ -67,7 +68,7 @@ def detect_format(path: str | Path) -> str:
 def _check_exists(path: Path) -> None:
     if not path.exists():
         raise FileNotFoundError(f"no file or folder at {path}: correct the path.")
-    if not (path.is_file() or path.is_dir()):  # reading a pipe would wait for its writer
+    if not (path.is_file() or path.is_dir()):  # reading a pipe would wait for its writing process
         raise ValueError(f"{path} is neither a file nor a folder, but a pipe or a device: copy the data to a file.")
 
 
@@ -94,37 +95,29 @@ def open_source(
     path: str | Path,
     format: str = "auto",
     *,
-    env: str | None = None,
-    state: str | Sequence[str] | None = None,
-    pixels: str | None = None,
-    action: str | None = None,
-    shift: int = 0,
     allow_incomplete: bool = False,
-    skip_bad_episodes: bool = False,
+    **source: Any,
 ) -> EpisodeSource:
-    """Opens a file or folder of somebody else's episodes.
+    """Opens a file or folder with episodes in another format.
 
     Args:
-        path: the file or folder.
-        format: ``"auto"``, or a key of :data:`FORMATS`.
+        path (str or Path): the file or folder.
+        format (str, optional): a key of :data:`FORMATS`. Default: ``"auto"``, see :func:`detect_format`.
 
     Keyword Args:
-        env: see :class:`EpisodeSource`, as the other arguments.
-        state: columns that make the state. For example ``["qpos", "qvel"]``.
-        pixels: the column of frames.
-        action: the column of actions.
-        shift: rows by which the actions are moved.
-        allow_incomplete: leave out the episodes that an interrupted recording did not finish.
-        skip_bad_episodes: leave out the episodes that are damaged, or hold a NaN or an infinity. Default: ``False``.
+        allow_incomplete (bool, optional): leave out the episodes that an interrupted recording did not finish.
+            Default: ``False``.
+        **source: ``env``, ``state``, ``pixels``, ``action``, ``shift`` and ``skip_bad_episodes`` of
+            :class:`EpisodeSource`.
 
     Returns:
-        the episodes, to be passed to :func:`convert` and closed after use.
+        the episodes, for :func:`convert`, to be closed after use.
 
     Raises:
         FileNotFoundError: there is nothing at ``path``.
         ImportError: the format needs a package that is missing.
         KeyError: a column is missing.
-        ValueError: an unknown format, or a file that is damaged, incomplete or laid out otherwise.
+        ValueError: an unknown format, or a file that is damaged, incomplete or of another layout.
     """
     path = Path(path).expanduser()
     if format != "auto" and format not in FORMATS:
@@ -132,21 +125,12 @@ def open_source(
     _check_exists(path)
     reader = FORMATS[detect_format(path) if format == "auto" else format]
     with reading(path):
-        # The others find out from the lengths of their columns what is not whole.
-        options = {"allow_incomplete": True} if allow_incomplete and reader in (NpzTable, LeRobotTable) else {}
+        # Tables of the other formats are checked by the lengths of their columns, in EpisodeSource.
+        options = {"allow_incomplete": True} if allow_incomplete and reader in (OGBenchTable, LeRobotTable) else {}
         table = reader(path, **options)
     try:
         with reading(path):
-            return EpisodeSource(
-                table,
-                env=env,
-                state=state,
-                pixels=pixels,
-                action=action,
-                shift=shift,
-                allow_incomplete=allow_incomplete,
-                skip_bad_episodes=skip_bad_episodes,
-            )
+            return EpisodeSource(table, allow_incomplete=allow_incomplete, **source)
     except BaseException:
         table.close()
         raise

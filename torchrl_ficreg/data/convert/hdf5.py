@@ -1,4 +1,4 @@
-"""HDF5 files: the official LeWM data and what current stable-worldmodel writes."""
+"""HDF5 files: the official LeWM data and those of current stable-worldmodel."""
 
 from __future__ import annotations
 
@@ -9,23 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_ficreg.data.convert.table import (
-    Bounds,
-    bounds_from_reader,
-    brief,
-    Column,
-    MOST_ROWS,
-    require,
-    runs,
-    some,
-    Table,
-)
+from torchrl_ficreg._utils import require
+from torchrl_ficreg.data.convert.table import Bounds, bounds_from_reader, brief, Column, MOST_ROWS, runs, some, Table
 
 LENGTH, OFFSET = "ep_len", "ep_offset"
 EPISODE_IDS = ("episode_idx", "ep_idx")
 
-# A chunk of the official files is 100 frames of 224 x 224, 15 MB. h5py's own cache of 1 MB holds none, so that every
-# chunk an episode shares with its neighbour would be decompressed twice.
+# A chunk of the official files is 100 frames of 224 x 224, 15 MB. h5py's own cache of 1 MB holds none of them: every
+# chunk with frames of two episodes would be decompressed twice.
 _CHUNK_CACHE_BYTES = 64 * 1024 * 1024
 _MOST_CHUNK_BYTES = 512 * 1024 * 1024  # unpacked to read one row; compressed, a small file can declare 4 GB
 
@@ -41,7 +32,7 @@ class HDF5Table(Table):
         ep_offset   0         4                [E]
 
     Args:
-        path: the file.
+        path (Path): the file.
 
     Raises:
         ImportError: h5py or hdf5plugin (for Blosc) is missing.
@@ -51,8 +42,8 @@ class HDF5Table(Table):
     format = "hdf5"
 
     def __init__(self, path: Path) -> None:
-        h5py = require("h5py")
-        require("hdf5plugin")  # registers Blosc by being imported
+        h5py = require("h5py", "data", purpose="HDF5")
+        require("hdf5plugin", "data", purpose="HDF5")  # registers Blosc by being imported
         try:
             self._file = h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES, rdcc_nslots=10_007)
         except OSError as error:
@@ -86,11 +77,11 @@ class HDF5Table(Table):
 
 
 def _find_datasets(file: Any) -> tuple[dict[str, Any], dict[str, str]]:
-    """All arrays of a file, those reached by soft links too, and why others are left out.
+    """All arrays of a file, also those reached by soft links, and the reasons why others are left out.
 
     Whatever would read another file is left out: a file from elsewhere must not copy private files into a dataset.
     """
-    h5py = require("h5py")
+    h5py = require("h5py", "data", purpose="HDF5")
     datasets: dict[str, Any] = {}
     left_out: dict[str, str] = {}
     links: dict[str, str] = {}
@@ -139,7 +130,7 @@ def _find_datasets(file: Any) -> tuple[dict[str, Any], dict[str, str]]:
 
 
 def _describe(data: Any) -> Column | str:
-    """What an array holds, or why it cannot be read."""
+    """Describes an array, or says why it cannot be read."""
     rows, *shape = data.shape
     try:
         dtype = data.dtype
@@ -153,7 +144,7 @@ def _describe(data: Any) -> Column | str:
 
 
 def _episodes(datasets: dict[str, Any], left_out: dict[str, str], path: Path) -> Bounds:
-    """Reads the episodes, from whichever description there is, and compares where there are two."""
+    """Reads where the episodes are, from ``ep_len`` or from episode ids, and compares them where there are both."""
     for name in (LENGTH, OFFSET):
         if name in left_out:
             raise ValueError(f"{path}: {name!r} {left_out[name]}: copy it into the file.")
@@ -191,7 +182,7 @@ def _in_order(starts: np.ndarray, lengths: np.ndarray) -> bool:
 
 
 def _check_declared(data: Any, most: int, path: Path) -> None:
-    """Refuses an array that declares more than can be, before anything of it is allocated."""
+    """Refuses an array that declares more values than were written, before any memory is allocated."""
     name = data.name.lstrip("/")
     if data.size > most or (not data.id.get_storage_size() and data.size and not data.is_virtual):
         raise ValueError(f"{path}: {name!r} declares {data.size} values, more than were written: the file is damaged.")
@@ -212,7 +203,7 @@ def _integers(data: Any, most: int, path: Path) -> np.ndarray:
 
 
 def _without_episodes(datasets: dict[str, Any], path: Path) -> str:
-    """The message for a file that does not say where its episodes are."""
+    """The error message for a file without a description of its episodes."""
     groups: dict[str, set[str]] = {}
     for name in datasets:
         for depth in range(1, min(name.count("/"), 2) + 1):

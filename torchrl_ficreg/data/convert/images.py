@@ -1,4 +1,4 @@
-"""Frames from elsewhere: decoded, channels first, at the wanted size."""
+"""Frames of other formats: decoded, channels first, scaled."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch.nn.functional import interpolate
 
-from torchrl_ficreg.data.convert.table import brief, require
+from torchrl_ficreg._utils import require
+from torchrl_ficreg.data.convert.table import brief
 from torchrl_ficreg.data.frames import default_threads, run_split
 
-
-# Pillow also knows formats that start other programs, such as EPS.
+# No others: Pillow also has formats that start other programs, such as EPS.
 _PICTURES = ("JPEG", "PNG", "WEBP")
 
 MOST_PIXELS = 4096 * 4096  # of one frame; a small file can declare a picture that fills the memory
@@ -23,11 +23,12 @@ def decode(cells: Sequence[bytes], shape: tuple[int, ...] | None = None, *, firs
     """Decodes pictures (JPEG, PNG, WebP) on several threads: the decoder releases the interpreter.
 
     Args:
-        cells: encoded pictures of one size.
-        shape: [H, W, 3], the size they must have, compared before a picture is decoded. Default: that of the first.
+        cells (sequence of bytes): encoded pictures of one size.
+        shape (tuple of int, optional): [H, W, 3], the size they must have, compared before a picture is decoded.
+            Default: that of the first.
 
     Keyword Args:
-        first_row: row of the first picture, for messages. Default: 0.
+        first_row (int, optional): row of the first picture, for messages. Default: ``0``.
 
     Returns:
         [L, H, W, 3] uint8.
@@ -36,11 +37,11 @@ def decode(cells: Sequence[bytes], shape: tuple[int, ...] | None = None, *, firs
         ImportError: Pillow is missing.
         ValueError: a picture is damaged, of another format or too large, or they differ in size.
     """
-    image = require("PIL.Image", "pillow")
+    image = require("PIL.Image", "data", purpose="a column of images", package="Pillow")
 
     def size_of(row: int) -> tuple[int, int, int]:
         with image.open(io.BytesIO(cells[row]), formats=_PICTURES) as picture:
-            if picture.mode.startswith(("I", "F")):  # which Pillow would cut off at 255
+            if picture.mode.startswith(("I", "F")):  # Pillow would clip them at 255
                 raise ValueError(f"it has more than 8 bits a channel (mode {picture.mode}): scale it to 0..255 first")
             return (picture.height, picture.width, 3)
 
@@ -88,7 +89,7 @@ def to_frames(images: np.ndarray) -> np.ndarray:
     """Moves the channels in front of height and width.
 
     Args:
-        images: [L, H, W, 3] or [L, 3, H, W] uint8.
+        images (ndarray): [L, H, W, 3] or [L, 3, H, W] uint8.
 
     Returns:
         [L, 3, H, W] uint8, contiguous.
@@ -103,11 +104,11 @@ def to_frames(images: np.ndarray) -> np.ndarray:
 
 
 def resize(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Scales frames, each new pixel being the mean of the area it covers, rounded.
+    """Scales frames: each new pixel is the rounded mean of the area it covers.
 
     Args:
-        frames: [L, 3, H, W] uint8.
-        size: new height and width.
+        frames (ndarray): [L, 3, H, W] uint8.
+        size (tuple of int): new height and width.
 
     Returns:
         [L, 3, *size] uint8.

@@ -1,4 +1,4 @@
-"""Lance tables as stable-worldmodel writes them by default."""
+"""Lance tables, the default format of stable-worldmodel."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from torchrl_ficreg._utils import require
 from torchrl_ficreg.data.convert._arrow import describe, first_cells, split, to_array
-from torchrl_ficreg.data.convert.table import bounds_from_ids, check_inside, check_steps, require, some, Table
+from torchrl_ficreg.data.convert.table import bounds_from_ids, check_inside, check_steps, some, Table
 
 EPISODE_IDS, STEPS = ("episode_idx", "ep_idx"), "step_idx"
 
@@ -16,10 +17,10 @@ EPISODE_IDS, STEPS = ("episode_idx", "ep_idx"), "step_idx"
 class LanceTable(Table):
     """Rows with ``episode_idx`` and ``step_idx``, frames as JPEG bytes, numbers as float32 lists.
 
-    Frames lost a little to JPEG and states were rounded to float32 when the table was written; both stay so.
+    The table itself is lossy: frames went through JPEG, and states were rounded to float32. Both are read as they are.
 
     Args:
-        path: the ``.lance`` folder.
+        path (Path): the ``.lance`` folder.
 
     Raises:
         ImportError: lance is missing.
@@ -29,13 +30,13 @@ class LanceTable(Table):
     format = "lance"
 
     def __init__(self, path: Path) -> None:
-        lance = require("lance", "pylance")
+        lance = require("lance", "data", purpose="Lance", package="pylance")
         for folder, _, files in os.walk(path):
             for file in files:
                 check_inside(Path(folder, file), path)
         self._dataset = lance.dataset(str(path))
         parts = [file for fragment in self._dataset.get_fragments() for file in fragment.metadata.files]
-        # A manifest may name other folders, or addresses in the network, as the place of its data.
+        # A manifest may name other folders, or addresses in the network, where its data lies.
         if self._dataset.base_paths() or any(file.base_id is not None or not _is_plain(file.path) for file in parts):
             raise ValueError(f"{path} keeps rows outside of its folder, which is not followed: copy the table as a whole.")
         rows = self._dataset.count_rows()

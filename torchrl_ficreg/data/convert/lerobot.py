@@ -1,4 +1,4 @@
-"""LeRobot-style folders: parquet files with a description beside them."""
+"""LeRobot folders: parquet files and a description in ``meta/``."""
 
 from __future__ import annotations
 
@@ -9,45 +9,36 @@ from typing import Any
 import numpy as np
 
 from torchrl_ficreg._utils import MOST_JSON_BYTES, read_bytes
-from torchrl_ficreg.data.convert._arrow import describe, first_cells, split, to_array
-from torchrl_ficreg.data.convert.table import (
-    Bounds,
-    bounds_from_ids,
-    brief,
-    check_inside,
-    check_steps,
-    require,
-    some,
-    Table,
-)
+from torchrl_ficreg.data.convert._arrow import describe, first_cells, require_arrow, split, to_array
+from torchrl_ficreg.data.convert.table import Bounds, bounds_from_ids, brief, check_inside, check_steps, some, Table
 
 INFO = "meta/info.json"
 EPISODE_IDS, STEPS = "episode_index", "frame_index"
-_BATCH_ROWS = 256  # of frames held at once while a row group is read
+_BATCH_ROWS = 256  # rows held in memory at once while a row group is read
 
 
 class LeRobotTable(Table):
     """``data/**/*.parquet`` with ``episode_index``, ``frame_index`` and the features of ``meta/info.json``.
 
-    Both generations are read: one file per episode, and files of many episodes. Frames must be image columns
-    (encoded bytes in the table); a data set that keeps them in video files has to be exported with images first.
+    Both versions of the format are read: one file per episode, and files of many episodes. Frames must be image columns
+    (encoded bytes in the table); a data set with its frames in video files has to be exported with images first.
 
     Args:
-        path: the folder.
+        path (Path): the folder.
 
     Keyword Args:
-        allow_incomplete: take the whole episodes of the files that can be read. Default: ``False``.
+        allow_incomplete (bool, optional): take the whole episodes of the files that can be read. Default: ``False``.
 
     Raises:
-        ImportError: pyarrow, which comes with pylance, is missing.
+        ImportError: pyarrow, which is installed with pylance, is missing.
         ValueError: frames are in video files only, a file is damaged, or rows are missing.
     """
 
     format = "lerobot"
 
     def __init__(self, path: Path, *, allow_incomplete: bool = False) -> None:
-        self._parquet = require("pyarrow.parquet", "pylance")
-        # Hidden files, such as the ._ ones that macOS writes beside every file of some disks, are no part of it.
+        self._parquet = require_arrow("pyarrow.parquet")
+        # Hidden files do not belong to it, such as the ._ files that macOS writes beside every file on some disks.
         found = sorted((path / "data").rglob("*.parquet"))
         files = [file for file in found if not any(part.startswith(".") for part in file.relative_to(path).parts)]
         if not files:
@@ -118,7 +109,7 @@ class LeRobotTable(Table):
 
     def read(self, name: str, start: int, stop: int) -> np.ndarray:
         """Reads rows of a column, which may lie in several row groups; see :meth:`Table.read`."""
-        arrow = require("pyarrow")
+        arrow = require_arrow("pyarrow")
         first = int(np.searchsorted(self._group_starts, start, side="right")) - 1
         pieces: list[Any] = []
         for place in range(first, len(self._groups)):
@@ -136,7 +127,7 @@ class LeRobotTable(Table):
         return to_array(arrow.chunked_array(pieces), self.columns[name], start)
 
     def _whole(self, bounds: Bounds, ids: np.ndarray, steps: np.ndarray, path: Path) -> Bounds:
-        """The episodes whose steps count up from 0 and, where the folder says how long they are, to the end."""
+        """The episodes whose steps count up from 0 and, where their length is declared, to the last."""
         declared = _declared_lengths(path, self._parquet)
         kept = []
         for start, length in zip(*bounds):
@@ -169,7 +160,7 @@ def _read_info(path: Path) -> dict[str, Any]:
 
 
 def _declared_lengths(path: Path, parquet: Any) -> dict[int, int]:
-    """Episode -> rows, from either generation's description; empty where there is none that can be read."""
+    """Episode -> declared number of rows, from either version of the format; empty where it cannot be read."""
     lengths: dict[int, int] = {}
     try:
         if (path / "meta/episodes.jsonl").is_file():
@@ -181,7 +172,7 @@ def _declared_lengths(path: Path, parquet: Any) -> dict[int, int]:
             check_inside(file, path)
             columns = parquet.read_table(file, columns=[EPISODE_IDS, "length"]).to_pydict()
             lengths.update(zip(columns[EPISODE_IDS], columns["length"]))
-    except Exception:  # it only helps to find torn episodes
+    except Exception:  # the lengths only help to find incomplete episodes
         return lengths
     return lengths
 

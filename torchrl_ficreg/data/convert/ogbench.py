@@ -1,4 +1,4 @@
-"""OGBench files: compressed numpy archives, read as a stream."""
+"""OGBench files: compressed numpy archives, read as streams."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ TERMINALS = "terminals"
 _SKIP_BYTES = 1024 * 1024
 
 
-class NpzTable(Table):
-    """Flat ``observations``, ``actions`` and ``terminals``; a visual file has its frames in ``observations``.
+class OGBenchTable(Table):
+    """Flat ``observations``, ``actions`` and ``terminals``; in files of visual tasks ``observations`` are the frames.
 
     ::
 
         row           0  1  2  3 | 4  5 ...
         observations  s0 s1 s2 s3| s0 s1
-        actions       a0 a1 a2 - | a0 a1          what stands in the last row of an episode leads nowhere
+        actions       a0 a1 a2 - | a0 a1          the action in the last row of an episode is not used
         terminals     0  0  0  1 | 0  0           1 marks the row of the last observation
 
-    An archive cannot be entered in the middle: rows are read in order, and going back means starting again.
+    A compressed array can only be read from its beginning: rows are read in order, and an earlier row starts again.
 
     Args:
-        path: the file.
+        path (Path): the file.
 
     Keyword Args:
-        allow_incomplete: leave out the rows after the last terminal one. Default: ``False``.
+        allow_incomplete (bool, optional): leave out the rows after the last terminal one. Default: ``False``.
 
     Raises:
         ValueError: the archive is damaged, incomplete or without ``terminals``.
@@ -54,7 +54,7 @@ class NpzTable(Table):
             for name in names:
                 try:
                     self._members[name] = _Member(self._archive, name)
-                except Exception as error:  # stray members, objects, damage: only what is asked for can refuse a file
+                except Exception as error:  # stray members, objects, damage: an error only if the array is needed
                     self.left_out[name] = f"cannot be read: {brief(error)}"
             if TERMINALS in self.left_out:
                 raise ValueError(
@@ -97,7 +97,7 @@ class NpzTable(Table):
 
 
 class _Member:
-    """One array of the archive, read forwards."""
+    """One array of the archive, read in order."""
 
     def __init__(self, archive: zipfile.ZipFile, name: str) -> None:
         self._archive, self._name = archive, f"{name}.npy" if f"{name}.npy" in archive.namelist() else name

@@ -1,4 +1,4 @@
-"""Episodes of a foreign file, one at a time, as our writer takes them."""
+"""Episodes of a source file, read one at a time in the layout of :class:`~torchrl_ficreg.data.EpisodeWriter`."""
 
 from __future__ import annotations
 
@@ -15,74 +15,48 @@ from torchrl_ficreg.data.convert.table import brief, is_foreign, Kind, some, Tab
 from torchrl_ficreg.keys import ACTION, PIXELS, STATE
 
 
-@dataclass(frozen=True)
-class TaskColumns:
-    """What a file has to hold for one environment.
-
-    Attributes:
-        states: candidates in order of preference; each is a list of columns that are joined.
-        state_dim: S.
-        action_dim: A. Every component of these environments' actions is bounded by -1 and 1.
-    """
-
-    states: tuple[tuple[str, ...], ...]
-    state_dim: int
-    action_dim: int
-
-
-TASKS: dict[str, TaskColumns] = {
-    "two_room": TaskColumns((("state",), ("pos_agent",), ("proprio",)), state_dim=2, action_dim=2),
-    "push_t": TaskColumns((("state",),), state_dim=7, action_dim=2),
-    "reacher": TaskColumns((("qpos", "qvel"),), state_dim=4, action_dim=2),
-    "cube": TaskColumns((("qpos", "qvel"),), state_dim=41, action_dim=5),
-}
-
-# For any other data. The simulator's own coordinates come first: they are what restores it.
-OTHER_STATES = (("state",), ("qpos", "qvel"), ("observation.state",), ("observation",), ("observations",))
-OTHER_PIXELS = ("pixels", "observations", "observation.image", "image")
-OTHER_ACTIONS = ("action", "actions")
-
-
-# Frames read and scaled at once. Long episodes at 224 pixels would otherwise need their size several times over.
+# Frames read and scaled at once: a long episode at 224 pixels would otherwise be in memory several times.
 _BLOCK_ROWS = 200
 _BLOCK_BYTES = 64 * 2**20
 
-# Of one episode. A small file can declare more than any memory holds.
+# Limits of one episode: a small file can declare more than fits in memory.
 _MOST_EPISODE_ROWS = 1_000_000
 _MOST_NUMBERS = 64_000_000
 _MOST_FRAME_BYTES = 16 * 2**30
 
 
 class EpisodeSource:
-    """Reads episodes from a table lazily: nothing but the episode asked for is in memory.
+    """Reads episodes from a table lazily: only the requested episode is in memory.
 
-    Actions are put where our format has them, row t holding the one that leads to row t + 1. The last row leads
-    nowhere: whatever the file has there, a NaN or the action of a step that was not recorded, becomes zero.
+    Row t of an episode holds the action that leads to row t + 1. The action of the last row is always zero: whatever
+    the file has there, a NaN or the action of a step that was not recorded, is not used.
 
     Args:
-        table: the opened file.
+        table (Table): the opened file.
 
     Keyword Args:
-        env: one of ``two_room``, ``push_t``, ``reacher``, ``cube``: says which columns hold the state, and is noted
-            in the dataset. Any other name is only noted.
-        state: columns that make the state, joined in this order. Default: the environment's, or what other data
-            usually call it. Data without an ``env`` of this package may have none: [L, 0].
-        pixels: the column of frames. Default ``pixels``, or what other data usually call it.
-        action: the column of actions.
-        shift: rows by which the actions are moved: ``-1`` where the file keeps an action in the row it leads to,
-            ``1`` where it runs one row ahead. ``1`` costs the first row of each episode.
-        allow_incomplete: leave out the episodes that an interrupted recording did not finish.
-        skip_bad_episodes: see :meth:`leave_out_bad_episodes`. Default: ``False``.
+        env (str, optional): ``"two_room"``, ``"push_t"``, ``"reacher"`` or ``"cube"`` selects the columns of the state;
+            any other name is only stored with the dataset. Default: ``None``, unknown.
+        state (str or sequence of str, optional): columns that are joined to the state, such as ``["qpos", "qvel"]``.
+            Default: those of the environment, or usual names; data of other environments may have none: [L, 0].
+        pixels (str, optional): column of the frames. Default: ``"pixels"``, or another usual name.
+        action (str, optional): column of the actions. Default: ``"action"`` or ``"actions"``.
+        shift (int, optional): rows by which the actions are moved: ``-1`` where the file stores an action in the row it
+            leads to, ``1`` where it stores it one row too early, which costs the first row of each episode.
+            Default: ``0``.
+        allow_incomplete (bool, optional): leave out the episodes that an interrupted recording did not finish.
+            Default: ``False``.
+        skip_bad_episodes (bool, optional): see :meth:`leave_out_bad_episodes`. Default: ``False``.
 
     Attributes:
-        lengths: int64 [E], rows of each episode as served. Episodes of fewer than two rows are left out.
-        skipped: how many were left out.
+        lengths: int64 [E], rows of each episode that is served. Episodes of fewer than two rows are left out.
+        skipped: number of episodes that were left out for their length.
         notices: what else was left out, one sentence each.
         columns: key -> the names of the columns it is made of.
 
     Raises:
         KeyError: a column is missing.
-        ValueError: a column has another shape than its role asks for, or the recording is incomplete.
+        ValueError: a column has a shape that does not fit its role, or the recording is incomplete.
     """
 
     def __init__(
@@ -123,11 +97,10 @@ class EpisodeSource:
     def leave_out_bad_episodes(self) -> None:
         """Reads everything once, and leaves out the episodes that cannot be read or hold a NaN or an infinity.
 
-        Which they are has to be known before the first one is written: a conversion that is continued must count the
-        same episodes.
+        This happens before the first episode is written: a conversion that is resumed must number the episodes alike.
 
         Raises:
-            ValueError: no episode is good; the message says what is wrong with the first.
+            ValueError: no episode is left; the message names the error of the first.
         """
         reasons: dict[int, ValueError] = {}
         for index in range(len(self)):
@@ -154,8 +127,9 @@ class EpisodeSource:
         """Reads one episode.
 
         Args:
-            index: from 0.
-            image_size: height and width the frames are scaled to.
+            index (int): from 0.
+            image_size (tuple of int, optional): height and width the frames are scaled to. Default: ``None``, as they
+                are.
 
         Returns:
             ``pixels`` [L, 3, H, W] uint8, ``action`` [L, A] float32 and ``state`` [L, S] float64.
@@ -172,18 +146,18 @@ class EpisodeSource:
         """Reads one episode without its frames.
 
         Args:
-            index: from 0.
+            index (int): from 0.
 
         Returns:
-            action [L, A] float32, the last row as the file has it (NaN where it has none), and state [L, S] float64.
+            action [L, A] float32, with the last row of the file (NaN where it has none), and state [L, S] float64.
         """
         start, stop = self._rows(index)
-        with np.errstate(over="ignore"):  # what float32 cannot hold becomes an infinity, and is refused as one
+        with np.errstate(over="ignore"):  # numbers beyond float32 become infinities, which are refused
             action = self._joined(ACTION, start, stop).astype(np.float32)
         state = self._joined(STATE, start, stop)
         if self.shift:
             action = np.roll(action, self.shift, axis=0)
-            action[-1] = np.nan  # -1 takes it away; with 1 it is the action that leads nowhere
+            action[-1] = np.nan  # with -1 there is none, with 1 it leads nowhere
         return (action[1:], state[1:]) if self.shift == 1 else (action, state)
 
     def close(self) -> None:
@@ -197,7 +171,7 @@ class EpisodeSource:
         self.close()
 
     def facts(self) -> dict[str, Any]:
-        """What the dataset notes about where it came from: equal for equal files, whatever folder they are in."""
+        """The origin, as it is stored with the dataset: equal for equal files, in whatever folder they are."""
         numbers = [np.ascontiguousarray(value) for value in self.vectors(0)]
         return {
             "format": self.table.format,
@@ -227,7 +201,7 @@ class EpisodeSource:
                 first = " Are the actions stored where they lead to? Then shift=-1." if key == ACTION and not bad[0] else ""
                 raise ValueError(
                     f"{self.table.path}, episode {index}: {some(self.columns[key], 2)} holds a NaN or an infinity in row "
-                    f"{bad[0]} of {len(state)}: mend it, or pass skip_bad_episodes=True to leave such episodes out.{first}"
+                    f"{bad[0]} of {len(state)}: correct it, or pass skip_bad_episodes=True to leave such episodes out.{first}"
                 )
 
     def _read(self, name: str, start: int, stop: int) -> np.ndarray:
@@ -264,7 +238,7 @@ class EpisodeSource:
         return frames
 
     def _blocks(self, index: int) -> Iterator[np.ndarray]:
-        """The frames of an episode [L', 3, H, W], as many at once as memory is sure to take."""
+        """The frames of an episode in blocks [L', 3, H, W] of bounded size."""
         start, stop = self._rows(index)
         start += max(self.shift, 0)
         step = min(max(_BLOCK_BYTES // (3 * self.frame_shape[0] * self.frame_shape[1]), 1), _BLOCK_ROWS)
@@ -281,10 +255,10 @@ class EpisodeSource:
     def _usual_pixels(self) -> list[str]:
         cameras = [name for name in self.table.of_kind("image") if name.startswith("observation.images.")]
         cameras = cameras or [name for name in self.table.left_out if name.startswith("observation.images.")][:1]
-        return [*OTHER_PIXELS, *(cameras if len(cameras) == 1 else [])]  # of several, the user has to choose
+        return [*OTHER_PIXELS, *(cameras if len(cameras) == 1 else [])]  # of several cameras the user has to choose one
 
     def _choose_state(self, state: str | Sequence[str] | None, usual: Sequence[Sequence[str]]) -> list[str]:
-        """No loss reads the state, so that data of other environments may have none."""
+        """The columns of the state; data of other environments may have none, since no loss reads it."""
         if state is not None and len(state):
             return self._choose(STATE, [[state] if isinstance(state, str) else state])
         try:
@@ -320,7 +294,7 @@ class EpisodeSource:
         raise KeyError(f"{self.table.path} has no {kind} column for {role}: tried {tried}, got {some(there)}: {advice}.")
 
     def _unfit(self, name: str, kind: Kind) -> str | None:
-        """What is wrong with something of a wanted name that is there, and what to do."""
+        """What is wrong with a column of a wanted name, and what to do."""
         found = self.table.find(name)
         if found is None:
             return self.table.unusable(name)
@@ -337,7 +311,7 @@ class EpisodeSource:
         return f"holds no frames, but {shape} (encoded pictures?): decode them to uint8 RGB and use from_arrays()"
 
     def _count_whole(self, allow_incomplete: bool) -> int:
-        """Episodes all of whose rows are there."""
+        """Number of episodes all of whose rows are there."""
         ends = self.table.starts + self.table.lengths
         present = min(self.table.columns[name].rows for names in self.columns.values() for name in names)
         whole = int((ends <= present).sum())
@@ -377,3 +351,34 @@ class EpisodeSource:
                     f"{self.env} has {want} numbers of {key}, {names} of {self.table.path} has {got[key]}: correct "
                     f"env=, or name the columns by {key}=."
                 )
+
+
+# ------------------------------------------------------------------ columns of known datasets
+
+
+@dataclass(frozen=True)
+class TaskColumns:
+    """Columns that a file of one environment has to have.
+
+    Attributes:
+        states: candidates for the state in order of preference; each is a list of columns that are joined.
+        state_dim: S.
+        action_dim: A. Every component of these environments' actions is bounded by -1 and 1.
+    """
+
+    states: tuple[tuple[str, ...], ...]
+    state_dim: int
+    action_dim: int
+
+
+TASKS: dict[str, TaskColumns] = {
+    "two_room": TaskColumns((("state",), ("pos_agent",), ("proprio",)), state_dim=2, action_dim=2),
+    "push_t": TaskColumns((("state",),), state_dim=7, action_dim=2),
+    "reacher": TaskColumns((("qpos", "qvel"),), state_dim=4, action_dim=2),
+    "cube": TaskColumns((("qpos", "qvel"),), state_dim=41, action_dim=5),
+}
+
+# Usual names in other data. The coordinates of the simulator come first: they restore it.
+OTHER_STATES = (("state",), ("qpos", "qvel"), ("observation.state",), ("observation",), ("observations",))
+OTHER_PIXELS = ("pixels", "observations", "observation.image", "image")
+OTHER_ACTIONS = ("action", "actions")

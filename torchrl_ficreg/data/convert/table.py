@@ -1,22 +1,20 @@
-"""What every foreign file is to us: a table of rows, episode after episode, with named columns."""
+"""Common interface of source files: a table of rows with named columns, episode after episode."""
 
 from __future__ import annotations
 
-import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 Kind = Literal["number", "image", "text"]
 
-MOST_ROWS = 1_000_000_000  # of one file; a small file can declare more than any memory holds
-_PIECE_ROWS = 1_000_000  # read at once of columns that cover the whole file
+MOST_ROWS = 1_000_000_000  # of one file; a small file can declare more than fits in memory
+_PIECE_ROWS = 1_000_000  # rows read at once from a column that covers the whole file
 
 
 @dataclass(frozen=True)
@@ -24,10 +22,9 @@ class Column:
     """One column of a table.
 
     Attributes:
-        shape: of one row; that of the decoded picture for encoded frames.
-        kind: ``"image"`` is uint8 with at least two axes, or an encoded picture; ``"text"`` is anything that holds
-            no numbers.
-        rows: how many there are; fewer than the episodes promise where a recording was interrupted.
+        shape: of one row; for encoded frames that of the decoded picture.
+        kind: ``"image"`` is uint8 with at least two axes, or an encoded picture; ``"text"`` is anything without numbers.
+        rows: number of rows; fewer than the episodes need where a recording was interrupted.
     """
 
     shape: tuple[int, ...]
@@ -36,21 +33,23 @@ class Column:
 
 
 class Table(ABC):
-    """A foreign file, opened.
+    """An opened source file.
+
+    A new format is a subclass that finds the columns and episodes in its constructor and implements :meth:`read`.
 
     Args:
-        path: the file or folder, for messages and for the record.
-        columns: name -> what it holds.
-        starts: int64 [E], first row of each episode, increasing.
-        lengths: int64 [E], rows of each episode.
+        path (Path): the file or folder, for messages and for the converted dataset.
+        columns (dict): name -> :class:`Column`.
+        starts (ndarray): int64 [E], first row of each episode, increasing.
+        lengths (ndarray): int64 [E], rows of each episode.
 
     Raises:
         ValueError: there is no episode.
     """
 
     format: str
-    notices: Sequence[str] = ()  # what was left out on request, for the summary of a conversion
-    left_out: Mapping[str, str] = {}  # name -> why what the file holds there is no column
+    notices: Sequence[str] = ()  # what was left out on request, for the warnings of a conversion
+    left_out: Mapping[str, str] = {}  # name -> why it cannot be read as a column
 
     def __init__(self, path: Path, columns: Mapping[str, Column], starts: np.ndarray, lengths: np.ndarray) -> None:
         if not len(lengths):
@@ -61,7 +60,7 @@ class Table(ABC):
         self.lengths = np.asarray(lengths, np.int64)
 
     def unusable(self, name: str) -> str | None:
-        """Why there is no column of that name, where the file holds something under it."""
+        """The reason why something of that name in the file cannot be read as a column; None where there is nothing."""
         plain = _plain(name)
         return next((reason for other, reason in self.left_out.items() if _plain(other) == plain), None)
 
@@ -77,7 +76,7 @@ class Table(ABC):
         """Releases the file."""
 
     def find(self, name: str) -> str | None:
-        """The column of that name, where ``/``, ``.`` and ``_`` are the same letter; ``None`` if there is none."""
+        """The column of that name, with ``/``, ``.`` and ``_`` taken for the same character; ``None`` if there is none."""
         if name in self.columns:
             return name
         plain = _plain(name)
@@ -93,7 +92,7 @@ def _plain(name: str) -> str:
 
 
 class Bounds(NamedTuple):
-    """Where episodes lie.
+    """Positions of the episodes in a table.
 
     Attributes:
         starts: int64 [E], first rows.
@@ -108,8 +107,8 @@ def bounds_from_ids(ids: np.ndarray, where: str | Path) -> Bounds:
     """Finds the episodes in a column that names the episode of every row.
 
     Args:
-        ids: [N] integers, equal within an episode.
-        where: names the file in errors.
+        ids (ndarray): [N] integers, equal within an episode.
+        where (str or Path): name of the file, for errors.
 
     Raises:
         ValueError: the rows of an episode are not next to each other.
@@ -126,9 +125,9 @@ def bounds_from_reader(read: Callable[[int, int], np.ndarray], rows: int, where:
     """As :func:`bounds_from_ids`, for a column that is read in pieces.
 
     Args:
-        read: ``read(start, stop)`` returns those rows of the column.
-        rows: N.
-        where: names the file in errors.
+        read (callable): ``read(start, stop)`` returns those rows of the column.
+        rows (int): N.
+        where (str or Path): name of the file, for errors.
 
     Raises:
         ValueError: the rows of an episode are not next to each other.
@@ -137,7 +136,7 @@ def bounds_from_reader(read: Callable[[int, int], np.ndarray], rows: int, where:
 
 
 def runs(read: Callable[[int, int], np.ndarray], rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where equal values begin, int64 [R], and these values [R], of a column that is read in pieces."""
+    """First rows of the runs of equal values, int64 [R], and the values [R], of a column that is read in pieces."""
     starts, values, last = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], None
     for start in range(0, rows, _PIECE_ROWS):
         piece = np.asarray(read(start, min(start + _PIECE_ROWS, rows))).reshape(-1)
@@ -162,9 +161,9 @@ def check_steps(steps: np.ndarray, bounds: Bounds, where: str | Path) -> None:
     """Checks that a step column counts 0, 1, 2, ... within every episode.
 
     Args:
-        steps: [N] integers.
-        bounds: of the episodes that cover the N rows.
-        where: names the file in errors.
+        steps (ndarray): [N] integers.
+        bounds (Bounds): of the episodes that cover the N rows.
+        where (str or Path): name of the file, for errors.
 
     Raises:
         ValueError: it does not: rows are missing or in another order.
@@ -180,7 +179,7 @@ def check_steps(steps: np.ndarray, bounds: Bounds, where: str | Path) -> None:
 
 
 def brief(error: object, limit: int = 110) -> str:
-    """What another library says, in one line of at most ``limit`` characters."""
+    """The message of another library's error, in one line of at most ``limit`` characters."""
     text = " ".join(str(error.args[0] if isinstance(error, KeyError) and error.args else error).split())
     text = text or type(error).__name__
     return text if len(text) <= limit else f"{text[: limit - 3]}..."
@@ -198,16 +197,16 @@ def some(names: Sequence[str], most: int = 6) -> str:
 
 
 def is_foreign(error: BaseException) -> bool:
-    """Whether a library raised it about a file: a panic of a Rust library derives from BaseException."""
+    """Whether an error was raised by a library: a panic of a Rust library derives from BaseException only."""
     return isinstance(error, Exception) or type(error).__module__.startswith("pyo3")
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turns whatever a foreign library raises about a file into one ValueError that names the file.
+    """Converts whatever a library raises about a file into one ValueError that names the file.
 
     Raises:
-        ValueError: anything but a missing package or file, and but an error that names the file already.
+        ValueError: instead of any error apart from missing packages or files and errors that name the file already.
     """
     try:
         yield
@@ -222,7 +221,7 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def check_inside(file: Path, folder: Path) -> None:
-    """Refuses what is no regular file, and links that lead out of the folder of the data set.
+    """Refuses whatever is no regular file, and links that lead out of the folder of the data set.
 
     Raises:
         ValueError: with the name of the file.
@@ -235,16 +234,3 @@ def check_inside(file: Path, folder: Path) -> None:
         raise ValueError(f"{file} is a link that leads out of {folder.name}: copy the data set with its files (cp -rL).")
     if not place.is_file():
         raise ValueError(f"{file} is no regular file: copy the data set again.")
-
-
-def require(module: str, package: str | None = None) -> ModuleType:
-    """Imports an optional module.
-
-    Raises:
-        ImportError: it is missing; the message names the extra.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        needed = package or module
-        raise ImportError(f"this format needs {needed}: pip install 'torchrl_ficreg[data]' ({error}).") from error

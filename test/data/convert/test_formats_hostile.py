@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_files import encode, SIZE, write_lance, write_lerobot, write_lewm, write_ogbench, write_swm_hdf5
+from foreign_files import encode, SIZE, write_lance, write_lerobot, write_ogbench, write_swm_hdf5
 
-from torchrl_ficreg.data.convert import convert, open_source
+from torchrl_ficreg.data.convert import open_source
 from torchrl_ficreg.data.convert.images import decode
 from torchrl_ficreg.data.convert.table import reading
 
@@ -436,15 +436,3 @@ def test_flipped_bytes_never_end_in_anything_but_one_line(tmp_path, make_rows, l
             text = str(error.args[0])
             assert path.name in text and "\n" not in text
         file.write_bytes(kept[file])
-
-
-def test_a_file_of_this_kind_can_be_converted_as_far_as_it_is_good(tmp_path, make_rows):
-    """One bad episode of three is left out on request, and said."""
-    rows = make_rows([20, 25, 20])
-    path = write_lewm(tmp_path / "x.h5", rows)
-    with open_source(path, skip_bad_episodes=True) as source:
-        assert len(source) == 3 and not source.notices
-    rows["state"][30] = np.inf
-    path = write_lewm(tmp_path / "y.h5", rows)
-    with pytest.warns(UserWarning, match="1 of 3 episodes are bad and left out"):
-        convert(path, tmp_path / "target", skip_bad_episodes=True, check_alignment=False, progress=False)

@@ -1,9 +1,11 @@
-"""Claims about data as people have them.
+"""Claims about sources that are incomplete, uneven or of unusual types.
 
-1.  What no loss reads cannot refuse a source: a set of frames and actions is converted, opened and cut into clips.
-2.  One bad episode, one torn or stray file among many is left out on request, counted and said.
-3.  Frames of another dtype, layout or number of channels are named as what they are, in one short line.
+1.  Frames and actions suffice: data without a state are converted, opened and cut into clips.
+2.  Bad episodes, torn files and stray files are left out on request, with a notice of their number.
+3.  Frames of another dtype, layout or number of channels are refused in one short line that says what they are.
 4.  Arrays may be torch tensors or lists.
+5.  Lists that differ in length are refused, also where they add up to the right number of values; so are frames that
+    differ in size.
 """
 
 from __future__ import annotations
@@ -13,10 +15,12 @@ import json
 import numpy as np
 import pytest
 import torch
-from foreign_files import encode, write_lance, write_lerobot, write_swm_hdf5
+from foreign_files import encode, write_lance, write_lerobot, write_ogbench, write_swm_hdf5
 
 from torchrl_ficreg.data import EpisodeStore, OfflineTrajectories
-from torchrl_ficreg.data.convert import convert, from_arrays, open_source
+from torchrl_ficreg.data.convert import convert, from_arrays, measure_alignment, open_source
+from torchrl_ficreg.data.convert._arrow import require_arrow, to_array
+from torchrl_ficreg.data.convert.table import Column
 
 LENGTHS = [30] * 6
 
@@ -38,7 +42,7 @@ def test_frames_and_actions_are_enough_to_train_on(tmp_path, make_rows, way):
     batch = OfflineTrajectories(path, batch_size=4, num_frames=2).sample()
     assert set(batch.keys()) >= {"pixels", "action"} and EpisodeStore.open(path).header.shapes["state"] == (0,)
     with pytest.raises(ValueError, match="holds no state"):
-        OfflineTrajectories(path).require_state()
+        OfflineTrajectories(path).store.require_state()
 
 
 def test_the_state_of_a_named_environment_is_still_needed(tmp_path, make_rows):
@@ -56,10 +60,11 @@ def test_bad_episodes_are_left_out_on_request_and_counted(tmp_path, make_rows, e
     rows[column][3 * 30 + 11, 0] = value
     rows[column][4 * 30 + 2, 1] = value
     path = write_swm_hdf5(tmp_path / "x.h5", rows)
-    with pytest.raises(ValueError, match="episode 3: .* or pass skip_bad_episodes=True"):
+    with pytest.raises(ValueError, match=f"episode 3: '{column}' holds a NaN .* row 11 of 30: .* skip_bad_episodes=True"):
         convert(path, tmp_path / "refused", progress=False)
     with pytest.warns(UserWarning, match="2 of 6 episodes are bad and left out; the first: .*episode 3"):
         store = EpisodeStore.open(convert(path, tmp_path / "target", skip_bad_episodes=True, progress=False))
+    assert not from_arrays(**columns(make_rows(LENGTHS)), lengths=LENGTHS, skip_bad_episodes=True).notices
     kept = [want[index] for index in (0, 1, 2, 5)]
     assert store.num_episodes == 4
     np.testing.assert_array_equal(store.arrays["action"], np.concatenate([episode["action"] for episode in kept]))
@@ -235,3 +240,44 @@ def test_what_is_no_array_of_the_right_kind_is_refused_by_its_name(make_rows, na
     with pytest.raises((TypeError, ValueError), match=name) as error:
         from_arrays(**given)
     assert "\n" not in str(error.value)
+
+
+def test_lists_of_other_lengths_are_refused():
+    arrow = require_arrow("pyarrow")
+    kind = arrow.list_(arrow.float64())
+    column = Column((2,), "number", 2)
+    even = arrow.chunked_array([[[1.0, 2.0], [3.0, 4.0]]], kind)
+    np.testing.assert_array_equal(to_array(even, column), [[1, 2], [3, 4]])
+    with pytest.raises(ValueError, match=r"lists of 2 values were expected, got lengths \[1, 3\]"):
+        to_array(arrow.chunked_array([[[1.0], [2.0, 3.0, 4.0]]], kind), column)
+
+
+def test_frames_of_another_size_are_refused(make_rows, monkeypatch):
+    rows = make_rows(lengths=[20, 20])
+    columns = {key: rows[key] for key in ("pixels", "action", "state")}
+    source = from_arrays(**columns, lengths=[20, 20])
+    read = source.table.read
+
+    def halved(name, start, stop):
+        return read(name, start, stop)[:, ::2, ::2] if name == "pixels" else read(name, start, stop)
+
+    monkeypatch.setattr(source.table, "read", halved)
+    with pytest.raises(ValueError, match="frames must have one size"):
+        source.episode(1)
+
+
+def test_overflowing_states_are_not_called_aligned():
+    action = np.random.default_rng(0).normal(size=(200, 2))
+    state = np.concatenate([np.zeros((1, 2)), action.cumsum(0)[:-1]])
+    with np.errstate(over="ignore", invalid="ignore"):
+        assert measure_alignment([(np.roll(action, 1, 0), 1e200 * state)]).lag is None
+
+
+def test_an_archive_with_a_damaged_small_array_is_refused_by_name(tmp_path, make_rows):
+    path = write_ogbench(tmp_path / "play.npz", make_rows(dims=4))
+    content = bytearray(path.read_bytes())
+    place = content.find(b"terminals.npy") + 40
+    content[place] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=f"{path.name} cannot be read .*damaged"):
+        open_source(path)

@@ -32,24 +32,14 @@ def test_every_prefix_has_nearly_the_exact_fractions():
             assert abs(train - 0.8 * size) < 3  # independent draws would stray by 18 (2 sigma) at 500
 
 
-def test_the_seed_changes_the_split():
+def test_the_seed_changes_the_split_and_all_is_everything():
     assert split_episodes(100, "evaluation", seed=0).tolist() != split_episodes(100, "evaluation", seed=1).tolist()
-
-
-def test_all_is_everything():
     assert split_episodes(3, "all").tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize("fractions", [(0.8, 0.1), (0.8, 0.1, 0.2), (0.0, 0.5, 0.5), (1.1, -0.1, 0.0)])
-def test_bad_fractions_are_refused(fractions):
+def test_bad_fractions_and_unknown_splits_are_refused(fractions):
     with pytest.raises(ValueError, match="summing to 1"):
         split_episodes(10, "train", fractions=fractions)
-
-
-def test_an_unknown_split_is_refused():
     with pytest.raises(ValueError, match="split must be one of .* got 'test'"):
         split_episodes(10, "test")
-
-
-if __name__ == "__main__":
-    pytest.main([__file__])

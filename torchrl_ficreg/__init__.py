@@ -28,8 +28,10 @@ from torchrl_ficreg.objectives import (
 )
 from torchrl_ficreg.planners import (
     ActionEffort,
+    CEMConfig,
     CostSum,
     GoalDistance,
+    GoalPolicyPlanner,
     GradientConfig,
     GradientPlanner,
     ICEMConfig,
@@ -43,22 +45,27 @@ from torchrl_ficreg.planners import (
     MPPIConfig,
     PathDistance,
     PlanConfig,
-    PolicyPlanner,
     RandomShooting,
+    ShootingConfig,
 )
+from torchrl_ficreg.transforms import ActionBlocks, GoalImage
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "ActionBlocks",
     "ActionEffort",
     "ActionEncoder",
+    "CEMConfig",
     "CausalPredictor",
     "ConvEncoder",
     "CostSum",
     "CovariancePenalty",
     "FICRegLoss",
     "GoalDistance",
+    "GoalImage",
     "GoalPolicy",
+    "GoalPolicyPlanner",
     "GradientConfig",
     "GradientPlanner",
     "ICEMConfig",
@@ -80,9 +87,9 @@ __all__ = [
     "PLDMLoss",
     "PathDistance",
     "PlanConfig",
-    "PolicyPlanner",
     "RandomShooting",
     "SIGReg",
+    "ShootingConfig",
     "TemporalStraightness",
     "VarianceHinge",
     "ViTEncoder",

@@ -1,8 +1,10 @@
-"""N environments in W processes are the N environments of one process, bit for bit, and fail as clearly."""
+"""N environments in W processes are the N environments of one process, bit for bit, with the same errors."""
 
 from __future__ import annotations
 
+import copy
 import multiprocessing
+import pickle
 import threading
 import time
 
@@ -80,7 +82,7 @@ def test_there_are_as_many_processes_as_asked_for(groups):
     assert groups.batch_size == (5,)
 
 
-def test_it_meets_its_specs_which_are_those_of_a_serial_batch(both):
+def test_its_specs_hold_and_are_those_of_a_serial_batch(both):
     groups, serial = both
     check_env_specs(groups)
     for part in ("observation_spec", "full_action_spec", "full_reward_spec", "full_done_spec", "state_spec"):
@@ -150,7 +152,7 @@ def test_a_collector_runs_on_it(both):
     assert batches[0]["next", "truncated"].any()
 
 
-def test_what_is_handed_out_is_not_overwritten_later(groups):
+def test_returned_tensors_are_not_overwritten_later(groups):
     reset = groups.reset(list_of_kwargs=scenes(5))
     kept = reset.clone()
     groups.step(groups.rand_action(reset.clone()))
@@ -158,7 +160,7 @@ def test_what_is_handed_out_is_not_overwritten_later(groups):
     assert_same(reset, kept)
 
 
-def test_mistakes_are_raised_as_in_a_serial_batch_and_break_nothing(groups):
+def test_errors_are_those_of_a_serial_batch_and_the_batch_stays_usable(groups):
     bad = scenes(5)
     bad[3]["options"]["state"] = np.zeros(2)
     with pytest.raises(ValueError, match=r"option 'state' \[0.0, 0.0\] is not legal"):
@@ -171,14 +173,21 @@ def test_mistakes_are_raised_as_in_a_serial_batch_and_break_nothing(groups):
     assert groups.reset(list_of_kwargs=scenes(5))["state"][4].tolist() == [34.1, 40.2]
 
 
-def test_an_environment_that_cannot_be_built_says_so_and_leaves_no_process(groups):
+def test_it_refuses_to_be_copied(groups):
+    for copier in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match="neither copied nor pickled: build another one by make_env"):
+            copier(groups)
+    assert groups.reset()["state"].shape == (5, 2)
+
+
+def test_an_environment_that_cannot_be_built_raises_its_error_and_leaves_no_process(groups):
     before = set(multiprocessing.active_children())
     with pytest.raises(ImportError, match="pip install a-room"):
         make_env("test/NoRoom-v0", 2, num_workers=1)
     assert set(multiprocessing.active_children()) == before
 
 
-def test_a_worker_killed_in_a_step_is_an_error_at_once_and_leaves_no_process(groups):
+def test_a_killed_worker_raises_at_once_and_leaves_no_process(groups):
     """No waiting for the other worker, which is busy for a minute."""
     before = set(multiprocessing.active_children())
     env = make_env(NAME, 2, num_workers=2, image_size=8)

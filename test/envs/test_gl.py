@@ -1,7 +1,6 @@
-"""GL is touched late, given back quietly, and its absence is explained.
+"""GL is loaded late and released without messages, and its absence is explained.
 
-What happens at an interpreter's exit, or without a library, is tried in interpreters of its own, in which TorchRL loads
-MuJoCo before this package can.
+Exits of an interpreter, and machines without a library, are simulated in interpreters of their own.
 """
 
 from __future__ import annotations
@@ -15,11 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import torchrl_ficreg
 from torchrl_ficreg.envs import _gl as gl
 
 if importlib.util.find_spec("mujoco") is None:
     pytest.skip("MuJoCo is not installed: pip install 'torchrl_ficreg[envs]'", allow_module_level=True)
 
+ROOT = Path(torchrl_ficreg.__file__).parent
 needs_gl = pytest.mark.skipif(not gl.gl_works(), reason="no GL here: apt-get install libegl1 libgl1")
 SCENE = """
 <mujoco><worldbody>
@@ -40,8 +41,15 @@ def without(library):
     ctypes.CDLL.__init__ = refuse
     ctypes.util.find_library = lambda name: None if name in library else find(name)
 """
+# The module alone, without the package and its imports: two seconds less per interpreter.
+ALONE = f"""
+import sys, types
+for name, path in {{"torchrl_ficreg": {str(ROOT)!r}, "torchrl_ficreg.envs": {str(ROOT / "envs")!r}}}.items():
+    sys.modules[name] = types.ModuleType(name)
+    sys.modules[name].__path__ = [path]
+"""
 LOAD = f"""
-import ctypes, os, sys
+import os
 from torchrl_ficreg.envs import _gl as gl
 def scene():
     mujoco = gl.import_mujoco()
@@ -49,15 +57,24 @@ def scene():
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     return model, data
+def draw():
+    model, data = scene()
+    return gl.OffscreenRenderer(model, size=16).draw(data, 0)
 """
 
 
-def python(code: str, folder: Path, lacks: str = "", **variables: str) -> subprocess.CompletedProcess:
-    """Runs code in a fresh interpreter without a display and without a library, in which every warning is an error."""
+def python(
+    code: str, folder: Path, lacks: str = "", package: bool = False, **variables: str
+) -> subprocess.CompletedProcess:
+    """Runs code in a fresh interpreter without a display and without a library, in which every warning is an error.
+
+    With ``package`` it imports the whole package, and TorchRL loads MuJoCo before this module can.
+    """
     names = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "PYTHONPATH")
     environment = {key: value for key, value in os.environ.items() if key not in names} | variables
+    environment["PYTHONPATH"] = str(ROOT.parent)
     script = folder / "script.py"
-    script.write_text(LACK + (f"without({lacks!r})\n" if lacks else "") + LOAD + code)
+    script.write_text(LACK + (f"without({lacks!r})\n" if lacks else "") + ("" if package else ALONE) + LOAD + code)
     command = [sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning", str(script)]
     return subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
 
@@ -71,11 +88,12 @@ def scene():
     return model, data
 
 
-def test_egl_is_the_default_and_the_users_choice_stays(tmp_path):
-    code = "gl.import_mujoco(); print(os.environ['MUJOCO_GL'])"
-    for choice in ("egl", "osmesa", "glfw", "off"):
-        variables = {} if choice == "egl" else {"MUJOCO_GL": choice}
-        assert python(code, tmp_path, **variables).stdout.strip() == choice
+@pytest.mark.skipif(not gl._has_egl(), reason="no EGL library")
+def test_egl_is_the_default_and_another_choice_is_kept(monkeypatch):
+    for choice in (None, "osmesa", "glfw", "off"):
+        monkeypatch.delenv("MUJOCO_GL", raising=False) if choice is None else monkeypatch.setenv("MUJOCO_GL", choice)
+        gl.import_mujoco()
+        assert os.environ["MUJOCO_GL"] == (choice or "egl")
 
 
 @needs_gl
@@ -149,7 +167,7 @@ def test_renderers_do_not_disturb_each_other(scene):
 
 
 def test_only_drawing_needs_gl(tmp_path):
-    """Without the library one simulates; the first picture names the packages and the alternative."""
+    """Without the library the package is imported and simulates; a picture is an error that names the packages."""
     code = """
 model, data = scene()
 renderer = gl.OffscreenRenderer(model, size=16)
@@ -157,7 +175,7 @@ gl.import_mujoco().mj_step(model, data)
 print(data.time)
 renderer.draw(data, 0)
 """
-    result = python(code, tmp_path, lacks="libEGL")
+    result = python(code, tmp_path, lacks="libEGL", package=True)
     assert result.stdout.strip() == "0.002"
     message = result.stderr.strip().splitlines()[-1]
     assert message.startswith("RuntimeError: cannot draw with MUJOCO_GL='egl'")
@@ -166,23 +184,31 @@ renderer.draw(data, 0)
     assert "Exception ignored" not in result.stderr
 
 
-@pytest.mark.parametrize("backend", ["osmesa", "nonsense", *(pytest.param(name, marks=pytest.mark.slow) for name in ("glfw", "off"))])
-def test_a_backend_that_cannot_draw_here_is_named(backend, tmp_path):
-    code = "model, data = scene(); gl.OffscreenRenderer(model, size=16).draw(data, 0)"
-    result = python(code, tmp_path, lacks="OSMesa", MUJOCO_GL=backend, PYTHONWARNINGS="ignore")
-    assert f"RuntimeError: cannot draw with MUJOCO_GL='{backend}'" in result.stderr
-    assert "apt-get install libegl1 libgl1" in result.stderr
+@pytest.mark.parametrize("backends", [["osmesa"], ["nonsense", "glfw", "off"]])
+def test_a_backend_that_cannot_draw_here_is_named(backends, tmp_path):
+    """MuJoCo's own import fails with the first of them, and so would that of TorchRL."""
+    code = f"""
+for backend in {backends}:
+    os.environ["MUJOCO_GL"] = backend
+    try:
+        draw()
+    except RuntimeError as error:
+        print(error)
+"""
+    result = python(code, tmp_path, lacks="OSMesa", package=True, MUJOCO_GL=backends[0], PYTHONWARNINGS="ignore")
+    messages = result.stdout.splitlines()
+    assert len(messages) == len(backends), result.stderr
+    for backend, message in zip(backends, messages):
+        assert message.startswith(f"cannot draw with MUJOCO_GL='{backend}'") and "apt-get install libegl1 libgl1" in message
     assert "Exception ignored" not in result.stderr
 
 
 @pytest.mark.parametrize("backend", ["egl", pytest.param("osmesa", marks=pytest.mark.slow)])
-def test_nothing_is_said_at_exit(backend, tmp_path):
+def test_nothing_is_printed_at_exit(backend, tmp_path):
     """Renderers open, closed, dropped and in a cycle at exit; a worker that is ended, and one that is killed."""
     code = """
-def draw(connection):
-    model, data = scene()
-    renderer = gl.OffscreenRenderer(model, size=16)
-    connection.send(renderer.draw(data, 0).shape)
+def work(connection):
+    connection.send(draw().shape)
     connection.recv()
 if __name__ == "__main__":
     import multiprocessing
@@ -197,7 +223,7 @@ if __name__ == "__main__":
     del cycle
     for end in ("terminate", "return"):
         ours, theirs = context.Pipe()
-        process = context.Process(target=draw, args=(theirs,))
+        process = context.Process(target=work, args=(theirs,))
         process.start()
         print(ours.recv())
         if end == "terminate":
@@ -215,7 +241,7 @@ if __name__ == "__main__":
 
 
 @needs_gl
-def test_a_module_that_ends_egl_first_causes_no_noise(tmp_path):
+def test_a_module_that_terminates_egl_first_causes_no_message(tmp_path):
     """dm_control's own hook ends EGL at exit; it is registered after ours here, and so runs before."""
     if importlib.util.find_spec("dm_control") is None:
         pytest.skip("dm_control is not installed: pip install 'torchrl_ficreg[envs]'")
@@ -223,13 +249,14 @@ def test_a_module_that_ends_egl_first_causes_no_noise(tmp_path):
 model, data = scene()
 renderer = gl.OffscreenRenderer(model, size=16)
 renderer.draw(data, 0)
-gl.import_simulator("dm_control.mujoco")
+import dm_control.mujoco
 """
-    assert python(code, tmp_path).stderr == ""
+    result = python(code, tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
 
 
 @needs_gl
-def test_a_context_that_outlives_the_names_of_its_module_causes_no_noise(monkeypatch):
+def test_a_context_that_outlives_the_names_of_its_module_causes_no_message(monkeypatch):
     """An interpreter that ends clears the names of modules, and deletes what is left only then."""
     context = object.__new__(gl._context_class("egl"))
     monkeypatch.setattr(gl, "_was_forked", None)
@@ -243,8 +270,9 @@ def works_with(backend: str) -> bool:
         return gl.gl_works()
 
 
-def test_bad_arguments_are_refused(scene):
+def test_bad_arguments_and_a_missing_package_are_refused(scene, monkeypatch):
     with pytest.raises(ValueError, match="size must be a positive integer, got 0"):
         gl.OffscreenRenderer(scene[0], size=0)
-    with pytest.raises(ImportError, match=r"no_such_simulator is not installed .*torchrl_ficreg\[envs\]"):
-        gl.import_simulator("no_such_simulator")
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ImportError, match=r"mujoco is not installed .*torchrl_ficreg\[envs\]"):
+        gl.import_mujoco()

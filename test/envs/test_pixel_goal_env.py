@@ -1,40 +1,200 @@
-"""The goal protocol, shown on TwoRoom: exact restoration, refusals, rewards, and Gymnasium's own checks."""
+"""The protocol of PixelGoalEnv, kept by all environments: exact restoration, goals, seeds, errors, Gymnasium's checks."""
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import os
+import pkgutil
 import subprocess
 import sys
+import warnings
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
+from torchrl.envs.utils import check_env_specs
 
-import torchrl_ficreg.envs  # noqa: F401  registers the ids
+from torchrl_ficreg.envs import ENVIRONMENTS, make_env
+from torchrl_ficreg.envs._gl import gl_works
 from torchrl_ficreg.envs.two_room.env import TwoRoomEnv
 
 START = np.array([60.123456789, 112.987654321])
 GOAL = np.array([164.0, 112.0])
 BOTH = {"state": START, "goal_state": GOAL}
+NEEDED = {"push_t": "pymunk", "reacher": "dm_control", "cube": "ogbench"}
+SIZE = 16
+
+
+class Case:
+    """One environment, with a start and a goal."""
+
+    def __init__(self, name):
+        if name in NEEDED and importlib.util.find_spec(NEEDED[name]) is None:
+            pytest.skip(f"{NEEDED[name]} is not installed: pip install 'torchrl_ficreg[envs]'")
+        if name in ("reacher", "cube") and not gl_works():
+            pytest.skip("no GL here: apt-get install libegl1 libgl1")
+        self.name = name
+        if name == "cube":
+            from torchrl_ficreg.envs.cube import CubeArm
+
+            arm = CubeArm()
+            self.start = arm.resting(arm_yaw=0.3, cube_position=[0.4, 0.1], cube_yaw=0.2)
+            self.goal = arm.resting(arm_yaw=0.0, cube_position=[0.5, -0.1], cube_yaw=1.0)
+        else:
+            self.start, self.goal = (np.array(state) for state in {
+                "two_room": (START, GOAL),
+                # the disc beside the bar of the T
+                "push_t": ([190.0, 300.0, 256.0, 300.0, 0.5, 20.0, -30.0], [100.0, 100.0, 300.0, 260.0, 0.1, 0.0, 0.0]),
+                # several turns, on the wrist's stop and moving into it
+                "reacher": ([17.3, 2.85, -4.0, 5.5], [0.3, 0.2, 0.0, 0.0]),
+            }[name])
+        self.options = {"state": self.start, "goal_state": self.goal}
+
+    def build(self, **kwargs):
+        return ENVIRONMENTS[self.name].load_env()(image_size=SIZE, **{"terminate_on_success": False, **kwargs})
+
+    def actions(self, count):
+        size = self.build().action_space.shape
+        return np.random.default_rng(0).uniform(-1.2, 1.2, (count, *size)).astype(np.float32)
+
+
+@pytest.fixture(params=sorted(ENVIRONMENTS))
+def case(request):
+    return Case(request.param)
 
 
 def roll(env, actions):
     return [env.step(action) for action in actions]
 
 
-@pytest.mark.filterwarnings("ignore:.*render modes.*")
-@pytest.mark.parametrize("collision", ["swept", "endpoint"])
-def test_gymnasium_accepts_the_environment(collision):
-    check_env(gymnasium.make("torchrl_ficreg/TwoRoom-v0", collision=collision).unwrapped)
+def assert_same(ours, theirs):
+    assert all(ours[key].tobytes() == theirs[key].tobytes() for key in ours)
 
 
-def test_the_registered_id_truncates_after_100_steps_and_the_class_never():
+# ---------------------------------------------------------------------- claims about every environment
+
+
+def test_gymnasium_accepts_it(case):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*(render modes|infinity).*")
+        check_env(case.build(terminate_on_success=True))
+
+
+def test_torchrl_accepts_it_and_a_batch_steps_as_its_environments_do_alone(case):
+    check_env_specs(make_env(case.name, image_size=SIZE))
+    batch = make_env(case.name, 2, image_size=SIZE, terminate_on_success=False)
+    check_env_specs(batch)
+    swapped = {"state": case.goal, "goal_state": case.start}
+    many = batch.reset(list_of_kwargs=[{"options": case.options}, {"options": swapped}])
+    alone = case.build()
+    alone.reset(options=swapped)
+    for action in case.actions(10).reshape(5, 2, -1):
+        many = batch.step_mdp(batch.step(many.set("action", torch.from_numpy(action))))
+        assert_same(alone.step(action[1])[0], {key: value[1].numpy() for key, value in many.items()})
+
+
+def test_the_same_state_and_actions_give_the_same_bits(case):
+    """After another episode and in another environment; reset restores the states themselves bit for bit."""
+    actions, futures = case.actions(50), []
+    env = case.build()
+    for one in (env, env, case.build()):
+        observation, _ = one.reset(options=case.options)
+        assert_same(case.options, observation)
+        futures.append([outcome[0] for outcome in roll(one, actions)])
+    if case.name != "cube":  # which nothing touches
+        assert (np.ptp([observation["state"] for observation in futures[0]], axis=0) > 0).all()
+    for other in futures[1:]:
+        for ours, theirs in zip(futures[0], other, strict=True):
+            assert_same(ours, theirs)
+
+
+def test_any_visited_state_is_restored_with_its_picture_and_its_future(case):
+    """Except for PushT, whose solver caches contacts that are not part of the published state."""
+    env, fresh = case.build(), case.build()
+    env.reset(options=case.options)
+    outcomes = [outcome[0] for outcome in roll(env, case.actions(20))]
+    for middle in (6, 13):
+        restored, _ = fresh.reset(options={key: outcomes[middle][key] for key in case.options})
+        assert_same(outcomes[middle], restored)
+        if case.name != "push_t":
+            assert_same(outcomes[-1], roll(fresh, case.actions(20)[middle + 1 :])[-1][0])
+
+
+def test_drawing_does_not_change_the_simulation(case):
+    quiet, drawn = case.build(), case.build()
+    for env in (quiet, drawn):
+        env.reset(options=case.options)
+    for action in case.actions(5):
+        drawn.render()
+        drawn._draw(case.goal)
+        assert_same(quiet.step(action)[0], drawn.step(action)[0])
+
+
+def test_the_goal_picture_is_the_picture_at_the_goal_where_success_is_reported(case):
+    env = case.build()
+    goal_picture = env.reset(options=case.options)[0]["goal_pixels"]
+    observation, info = env.reset(options={"state": case.goal, "goal_state": case.goal})
+    assert np.array_equal(observation["pixels"], goal_picture)
+    assert np.array_equal(env.render().transpose(2, 0, 1), goal_picture)
+    assert info["success"].tolist() == [True]
+
+
+def test_seeds_fix_the_tasks_and_every_reset_draws_a_new_one(case):
+    first, second = case.build(), case.build()
+    ours = [first.reset(seed=7)[0], first.reset()[0]]
+    np.random.seed(0)  # the published cube would draw from here
+    theirs = [second.reset(seed=7)[0], second.reset()[0]]
+    for one, other in zip(ours, theirs, strict=True):
+        assert_same(one, other)
+    for other in (ours[1], first.reset(seed=8)[0]):
+        assert not np.array_equal(ours[0]["state"], other["state"])
+    assert not np.array_equal(ours[0]["state"], ours[0]["goal_state"])
+
+
+def test_callers_may_write_into_the_arrays_that_they_pass_and_receive(case):
+    options, actions = {key: state.copy() for key, state in case.options.items()}, case.actions(1)
+    env, untouched = case.build(), case.build()
+    observation, _ = env.reset(options=options)
+    untouched.reset(options=case.options)
+    for array in (*observation.values(), *options.values()):
+        array[...] = 33
+    assert_same(env.step(actions[0])[0], untouched.step(actions[0])[0])
+    assert np.array_equal(actions, case.actions(1))
+
+
+@pytest.mark.parametrize("value", [1e300, -1e3])
+def test_an_action_far_beyond_its_bounds_is_refused_and_changes_nothing(case, value):
+    env = case.build()
+    env.reset(options=case.options)
+    with pytest.raises(ValueError, match="action must be within"):
+        env.step(np.full(env.action_space.shape, value))
+    assert np.array_equal(env._get_state(), case.start)
+
+
+@pytest.mark.parametrize("size", [0, True, 8.0, "8"])
+def test_a_picture_size_that_is_no_positive_integer_is_refused(case, size):
+    with pytest.raises(ValueError, match="image_size must be a positive integer"):
+        ENVIRONMENTS[case.name].load_env()(image_size=size)
+
+
+# ---------------------------------------------------------------------- claims about the base class, shown on TwoRoom
+
+
+def test_the_registered_id_truncates_and_the_class_does_not():
     env = gymnasium.make("torchrl_ficreg/TwoRoom-v0", terminate_on_success=False)
     env.reset(seed=0)
     truncated = [outcome[3] for outcome in roll(env, [np.zeros(2, np.float32)] * 100)]
     assert truncated == [False] * 99 + [True]
     assert not env.unwrapped.step(np.zeros(2))[3]
+
+
+@pytest.mark.parametrize(("name", "limit"), [("Reacher", 200), ("PushT", 200), ("Cube", 200), ("TwoRoom", 100)])
+def test_registered_ids_have_time_limits(name, limit):
+    assert gymnasium.spec(f"torchrl_ficreg/{name}-v0").max_episode_steps == limit
 
 
 def test_the_observation_holds_two_pictures_and_two_states():
@@ -49,39 +209,6 @@ def test_the_observation_holds_two_pictures_and_two_states():
     assert info["success"].dtype == bool
 
 
-def test_reset_restores_states_bit_for_bit_and_the_future_with_them():
-    """The same 50 actions from the same state give the same bits, in another environment and after another episode."""
-    actions = np.random.default_rng(0).uniform(-1.5, 1.5, (50, 2))
-    futures = []
-    for env in (TwoRoomEnv(), TwoRoomEnv()):
-        for _ in range(2):
-            observation, _ = env.reset(options=BOTH)
-            assert observation["state"].tobytes() == START.tobytes()
-            assert observation["goal_state"].tobytes() == GOAL.tobytes()
-            futures.append([outcome[0] for outcome in roll(env, actions)])
-    for other in futures[1:]:
-        for ours, theirs in zip(futures[0], other, strict=True):
-            assert all(ours[key].tobytes() == theirs[key].tobytes() for key in ours)
-
-
-def test_any_visited_state_can_be_restored():
-    """Taking the state out halfway and putting it into a fresh environment continues the episode exactly."""
-    actions = np.random.default_rng(1).uniform(-1, 1, (60, 2)) + [0.4, -0.2]
-    env, fresh = TwoRoomEnv(), TwoRoomEnv()
-    env.reset(options=BOTH)
-    middle = roll(env, actions[:30])[-1][0]
-    restored, _ = fresh.reset(options={"state": middle["state"], "goal_state": middle["goal_state"]})
-    assert all(restored[key].tobytes() == middle[key].tobytes() for key in middle)
-    end, fresh_end = roll(env, actions[30:])[-1][0], roll(fresh, actions[30:])[-1][0]
-    assert all(end[key].tobytes() == fresh_end[key].tobytes() for key in end)
-
-
-def test_the_goal_picture_is_the_picture_seen_at_the_goal():
-    env = TwoRoomEnv()
-    goal_picture = env.reset(options=BOTH)[0]["goal_pixels"]
-    assert np.array_equal(env.reset(options={"state": GOAL, "goal_state": START})[0]["pixels"], goal_picture)
-
-
 def test_success_is_rewarded_reported_at_reset_too_and_ends_the_episode_if_asked():
     near = {"state": [60.0, 112.0], "goal_state": [79.0, 112.0]}
     for terminate in (True, False):
@@ -94,18 +221,8 @@ def test_success_is_rewarded_reported_at_reset_too_and_ends_the_episode_if_asked
     assert env.reset(options={"state": GOAL, "goal_state": GOAL})[1]["success"].item()
 
 
-def test_seeds_fix_the_tasks_and_every_reset_draws_a_new_one():
-    first, second = TwoRoomEnv(), TwoRoomEnv()
-    ours = [first.reset(seed=7)[0], first.reset()[0]]
-    theirs = [second.reset(seed=7)[0], second.reset()[0]]
-    for one, other in zip(ours, theirs, strict=True):
-        assert one["state"].tobytes() == other["state"].tobytes()
-        assert one["goal_state"].tobytes() == other["goal_state"].tobytes()
-    assert not np.array_equal(ours[0]["state"], ours[1]["state"])
-
-
 def test_drawn_tasks_lead_through_the_door_at_least_25_steps_away():
-    """Published data: the target is in the other room, at least 125 px away through the door."""
+    """Published: the target is in the other room, at least 125 px away through the door."""
     env, door = TwoRoomEnv(image_size=8), np.array([112.0, 49.0])
     for seed in range(200):
         observation, _ = env.reset(seed=seed)
@@ -116,28 +233,14 @@ def test_drawn_tasks_lead_through_the_door_at_least_25_steps_away():
         assert max(start.max(), goal.max()) <= 203
 
 
-def test_writing_into_arrays_from_outside_changes_nothing_inside():
-    options = {"state": START.copy(), "goal_state": GOAL.copy()}
-    env, untouched = TwoRoomEnv(), TwoRoomEnv()
-    observation, _ = env.reset(options=options)
-    untouched.reset(options=BOTH)
-    for array in (*observation.values(), *options.values()):
-        array[...] = 33
-    ours, theirs = env.step(np.ones(2))[0], untouched.step(np.ones(2))[0]
-    assert all(np.array_equal(ours[key], theirs[key]) for key in ours)
+@pytest.mark.parametrize("integer", [int, np.int64])
+def test_sizes_and_seeds_may_be_integers_of_numpy(integer):
+    env = TwoRoomEnv(image_size=integer(16))
+    assert type(env.image_size) is int and env.reset(seed=0)[0]["pixels"].shape == (3, 16, 16)
+    assert_same(env.reset(seed=integer(3))[0], env.reset(seed=3)[0])
 
 
-def test_actions_are_left_as_they_are():
-    env, action = TwoRoomEnv(), np.array([3.0, -0.5], np.float32)
-    env.reset(seed=0)
-    env.step(action)
-    assert action.tolist() == [3.0, -0.5]
-
-
-def test_render_gives_the_picture_with_channels_last():
-    env = TwoRoomEnv()
-    observation, _ = env.reset(seed=0)
-    assert np.array_equal(env.render().transpose(2, 0, 1), observation["pixels"])
+def test_render_without_a_mode_returns_none():
     silent = TwoRoomEnv(render_mode=None)
     silent.reset(seed=0)
     assert silent.render() is None
@@ -172,8 +275,6 @@ def test_a_bad_action_is_refused(action, message):
 
 
 def test_bad_constructor_arguments_are_refused_and_a_step_needs_a_reset():
-    with pytest.raises(ValueError, match="image_size must be a positive integer"):
-        TwoRoomEnv(image_size=0)
     with pytest.raises(ValueError, match="render_mode must be"):
         TwoRoomEnv(render_mode="human")
     with pytest.raises(ValueError, match="collision must be one of"):
@@ -182,14 +283,42 @@ def test_bad_constructor_arguments_are_refused_and_a_step_needs_a_reset():
         TwoRoomEnv().step(np.zeros(2))
 
 
-def test_importing_the_environments_loads_no_simulator():
-    """The ids are registered by name only. TorchRL itself loads MuJoCo while it looks for mujoco.mjx."""
-    heavy = ["pymunk", "mujoco", "dm_control", "matplotlib", "h5py", "wandb"]
-    script = (
-        "import sys, gymnasium, torchrl.envs; theirs = set(sys.modules); import torchrl_ficreg.envs; "
-        "assert 'torchrl_ficreg/TwoRoom-v0' in gymnasium.registry; "
-        f"sys.exit([name for name in {heavy} if name in sys.modules and name not in theirs] or None)"
-    )
+LEFT_OPEN = """
+import sys
+import gymnasium, torchrl.envs
+
+theirs = set(sys.modules)  # TorchRL loads MuJoCo while it looks for mujoco.mjx
+import torchrl_ficreg.envs
+from torchrl_ficreg.envs import ENVIRONMENTS, make_env
+
+if __name__ == "__main__":
+    assert all(entry.gym_id in gymnasium.registry for entry in ENVIRONMENTS.values())
+    print([name for name in {heavy} if name in sys.modules and name not in theirs])
+    for name, num_envs, num_workers in {cases}:
+        env = make_env(name, num_envs=num_envs, num_workers=num_workers, image_size=8)
+        env.rollout(2)
+        env.itself = env  # a cycle, so that only the end of the interpreter frees it
+        print(name)
+"""
+
+
+@pytest.mark.parametrize("num_workers", [None, pytest.param(2, marks=pytest.mark.slow)])
+def test_importing_loads_no_simulator_and_environments_left_open_are_silent_at_exit(num_workers, tmp_path):
+    """The ids are registered by name. At exit, pymunk and GL would print exceptions of their destructors."""
+    heavy = ["pymunk", "mujoco", "dm_control", "ogbench", "matplotlib", "h5py", "wandb"]
+    names = [name for name in ENVIRONMENTS if name not in NEEDED or importlib.util.find_spec(NEEDED[name])]
+    names = [name for name in names if name in ("two_room", "push_t") or gl_works()]
+    script = tmp_path / "left_open.py"
+    cases = [(name, num_workers or 1, num_workers) for name in names]
+    script.write_text(LEFT_OPEN.format(heavy=heavy, cases=cases))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment)
-    assert result.returncode == 0, result.stderr
+    result = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environment)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.splitlines() == ["[]", *names]
+
+
+def test_no_public_name_hides_a_module():
+    """``from torchrl_ficreg.envs.two_room import render`` is the module."""
+    for package in ("", *(f".{name}" for name in ENVIRONMENTS)):
+        module = importlib.import_module(f"torchrl_ficreg.envs{package}")
+        assert not {info.name for info in pkgutil.iter_modules(module.__path__)} & set(module.__all__)

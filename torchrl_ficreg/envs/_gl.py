@@ -1,7 +1,9 @@
-"""MuJoCo pictures without a window, by whichever GL library the machine has.
+"""Offscreen pictures of MuJoCo models, by the GL library that ``MUJOCO_GL`` names.
 
-GL is touched at the first picture and not before: physics needs none. What GL has been given is taken back in the one
-order that keeps every library quiet, be it by ``close``, by the garbage collector or at the interpreter's exit.
+GL is loaded at the first picture and not before: physics needs none. ``mujoco.Renderer`` is not used because it frees
+its buffers without making its context current, which deletes those of other renderers, and because it prints
+exceptions at the interpreter's exit. Here resources are released in an order that avoids both, by ``close``, by the
+garbage collector and at exit.
 """
 
 from __future__ import annotations
@@ -22,14 +24,13 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from torchrl_ficreg._utils import environment_variables
+from torchrl_ficreg._mujoco import import_without_gl
 
 if TYPE_CHECKING:
     import mujoco
 
 BACKEND_VARIABLE = "MUJOCO_GL"
-_OFF = "off"  # MuJoCo's word for no pictures at all
-_ON = ("", "1", "on", "true", "enable", "enabled", "glx")  # its words for a window, which GLFW makes
+_ON = ("", "1", "on", "true", "enable", "enabled", "glx")  # MuJoCo's values for a window, which GLFW opens
 _BACKENDS = ("egl", "osmesa", "glfw", "cgl")
 _MAX_GEOMS = 2000  # of a scene, decorations included
 _process: int | None = None  # that opened GL
@@ -44,7 +45,11 @@ renderer.close()
 
 
 def import_mujoco() -> ModuleType:
-    """Imports MuJoCo: ``import_simulator("mujoco")``.
+    """Imports MuJoCo such that it draws without a window.
+
+    On Linux with an EGL library, sets ``MUJOCO_GL=egl`` unless it is set, for MuJoCo and the modules built on it. On a
+    machine without a GL library MuJoCo is imported all the same: it simulates, and :class:`OffscreenRenderer` raises an
+    error that names the missing packages.
 
     Returns:
         the module ``mujoco``.
@@ -57,45 +62,19 @@ def import_mujoco() -> ModuleType:
         >>> mujoco.MjModel.from_xml_string("<mujoco/>").nq
         0
     """
-    return import_simulator("mujoco")
-
-
-def import_simulator(name: str) -> ModuleType:
-    """Imports MuJoCo, or a module built on it, such that it draws without a window.
-
-    On Linux, sets ``MUJOCO_GL=egl`` for all of them where there is an EGL library, unless the user has set it. They load
-    the GL library as they are imported; on a machine without it they are imported all the same: they simulate, and
-    :class:`OffscreenRenderer` says what is missing.
-
-    Args:
-        name: of the module, for instance ``"mujoco"`` or ``"ogbench.manipspace"``.
-
-    Returns:
-        the module.
-
-    Raises:
-        ImportError: it is not installed.
-
-    Examples:
-        >>> import_simulator("mujoco").__name__
-        'mujoco'
-    """
     if _has_egl():  # worker processes inherit the variable: without the library they could not even import TorchRL
         os.environ.setdefault(BACKEND_VARIABLE, "egl")
     try:
-        return importlib.import_module(name)
+        return import_without_gl()
     except ModuleNotFoundError as error:
-        raise ImportError(f"{name} is not installed ({error}): {how_to_install(name)}.") from error
-    except (AttributeError, ImportError, OSError, RuntimeError):  # PyOpenGL trips over a None without its library
-        with environment_variables({BACKEND_VARIABLE: _OFF}):
-            return importlib.import_module(name)
+        raise ImportError(f"mujoco is not installed ({error}): {how_to_install('mujoco')}.") from error
 
 
 def how_to_install(name: str) -> str:
-    """The command that installs a simulator, for errors.
+    """The command that installs a simulator, for error messages.
 
     Args:
-        name: of its module.
+        name (str): name of its module.
 
     Examples:
         >>> how_to_install("mujoco")
@@ -118,14 +97,10 @@ def _backend() -> str:
 
 
 def gl_works() -> bool:
-    """Tells whether pictures can be drawn here, without risking this process: a child draws one and is asked.
+    """Whether pictures can be drawn here; a child process draws one, because a failure could end this process.
 
     Returns:
         True if MuJoCo is installed and draws with the present ``MUJOCO_GL``, EGL by default.
-
-    Examples:
-        >>> isinstance(gl_works(), bool)
-        True
     """
     return _probe(_backend())
 
@@ -138,7 +113,7 @@ def _probe(backend: str) -> bool:
 
 
 class MujocoHolder:
-    """Copies and pickles of an object that keeps MuJoCo's module, under ``_mujoco``."""
+    """Makes objects that hold the module MuJoCo as ``_mujoco`` copyable and picklable."""
 
     _mujoco: ModuleType
 
@@ -152,11 +127,11 @@ class MujocoHolder:
 class OffscreenRenderer:
     """Draws square pictures of one MuJoCo model into arrays; opens GL at the first of them.
 
-    Any number may live in one process, beside other users of GL. A renderer belongs to the thread of its first draw.
+    A process may have any number of them, beside other users of GL. A renderer belongs to the thread of its first draw.
 
     Args:
-        model: what is drawn; the size of its own offscreen buffer does not matter.
-        size: height and width of the pictures, in pixels.
+        model (mujoco.MjModel): the model to draw; the size of its own offscreen buffer does not matter.
+        size (int): height and width of the pictures, in pixels.
 
     Raises:
         ValueError: ``size`` is not a positive integer.
@@ -183,7 +158,7 @@ class OffscreenRenderer:
         self._surface: _Surface | None = None
 
     def __reduce__(self) -> tuple[type, tuple[Any, int]]:
-        """A copy opens GL of its own."""
+        """A copy has a GL context of its own."""
         return type(self), (self._model, self._size)
 
     def draw(
@@ -195,17 +170,19 @@ class OffscreenRenderer:
         """Draws the model in one state.
 
         Args:
-            data: the state, with the positions of its bodies, cameras and lights up to date.
-            camera: number or name of a camera of the model, -1 for the free one, or a camera of one's own.
-            scene_option: which groups and decorations are shown; MuJoCo's defaults by default.
+            data (mujoco.MjData): the state, with the positions of its bodies, cameras and lights up to date.
+            camera (int, str or mujoco.MjvCamera): number or name of a camera of the model, -1 for the free one, or
+                another camera.
+            scene_option (mujoco.MjvOption, optional): which groups and decorations are shown. Default: ``None``,
+                MuJoCo's defaults.
 
         Returns:
             a new [3, size, size] uint8 array, red, green, blue; row 0 on top.
 
         Raises:
             ValueError: no such camera.
-            RuntimeError: GL is missing or refuses; the message names the packages to install. Or this process was
-                forked from one that had drawn, in which GL would wait for ever.
+            RuntimeError: GL is missing or fails; the message names the packages to install. Or this process was
+                forked from one that had drawn, where GL would deadlock.
         """
         mujoco = self._mujoco
         _refuse_fork()
@@ -215,11 +192,11 @@ class OffscreenRenderer:
         category = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, option, None, self._find_camera(camera), category, self._scene)
         self._surface.read(self._rectangle, self._scene, self._buffer)
-        # GL counts rows from below. np.array always copies; the buffer is overwritten by the next picture.
+        # GL counts rows from below. np.array copies: the next picture overwrites the buffer.
         return np.array(self._buffer[::-1].transpose(2, 0, 1), order="C")
 
     def close(self) -> None:
-        """Gives GL's resources back; a later draw takes new ones."""
+        """Releases the GL resources; a later draw opens new ones."""
         if self._surface is not None:
             self._surface.close()
             self._surface = None
@@ -246,7 +223,7 @@ class _Surface:
     """A GL context with MuJoCo's resources of one model in it, closed at the latest when the interpreter exits.
 
     Raises:
-        RuntimeError: GL is missing or refuses.
+        RuntimeError: GL is missing or fails.
     """
 
     def __init__(self, model: mujoco.MjModel, size: int) -> None:
@@ -266,13 +243,13 @@ class _Surface:
             raise RuntimeError(_advice(backend, error)) from error
         self._mujoco.mjr_setBuffer(self._mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._release = weakref.finalize(self, _release, self._gl, self._context)
-        # weakref's own hook may run after EGL's, which ends EGL. One registered now runs before it.
+        # weakref's own exit hook may run after that of EGL, which terminates EGL. A hook registered now runs before it.
         self._release.atexit = False
         atexit.register(self._release)
 
     def read(self, rectangle: mujoco.MjrRect, scene: mujoco.MjvScene, out: np.ndarray) -> None:
         """Renders the scene into ``out`` [size, size, 3] uint8, the lowest row first."""
-        self._gl.make_current()  # another context of this thread may have been used meanwhile
+        self._gl.make_current()  # another context of this thread may be current
         self._mujoco.mjr_render(rectangle, scene, self._context)
         self._mujoco.mjr_readPixels(out, None, rectangle, self._context)
 
@@ -298,16 +275,16 @@ def _release(gl: Any, context: Any) -> None:
     if _was_forked():  # they belong to the parent
         return
     try:
-        # MuJoCo deletes by numbers that mean something else in another context: its own has to be the current one.
+        # MuJoCo deletes buffers by number, and the numbers refer to the current context.
         gl.make_current()
         context.free()
-    except Exception:  # GL is already gone, and its resources with it
+    except Exception:  # GL has been terminated, and its resources are released
         pass
     gl.free()
 
 
 def _context_class(backend: str) -> type:
-    """Finds MuJoCo's GL context by name, even if MuJoCo was imported under another name; it frees itself quietly."""
+    """MuJoCo's GL context class of a backend, whichever backend MuJoCo was imported with; freeing it never raises."""
     if backend in _ON:
         backend = "cgl" if platform.system() == "Darwin" else "glfw"
     if backend not in _BACKENDS:
@@ -322,13 +299,13 @@ def _context_class(backend: str) -> type:
                 return
             try:
                 super().free()
-            except Exception:  # ended by another user of the same library: nothing is left to free
+            except Exception:  # terminated by another user of the same library: nothing is left to free
                 self._context = None
 
         def __del__(self) -> None:
             try:
                 self.free()
-            except TypeError:  # the names of this module are gone already: the interpreter ends, and GL with it
+            except TypeError:  # at exit the names of this module may be None already
                 pass
 
     return QuietContext
@@ -345,7 +322,7 @@ def _advice(backend: str, error: Exception) -> str:
 
 @contextmanager
 def _buffer_size(model: mujoco.MjModel, size: int) -> Iterator[None]:
-    """Lends the model an offscreen buffer of the pictures' size: neither too small for them nor wasteful."""
+    """Sets the offscreen buffer of a model to the size of the pictures within the context."""
     settings = model.vis.global_
     before = settings.offwidth, settings.offheight
     settings.offwidth = settings.offheight = size

@@ -1,43 +1,42 @@
-"""The goal protocol: what every environment of the package looks like from outside.
+"""The base class of all environments of the package: pictures, restorable states and goals.
 
-One scene, two states: the current one and the goal. Both are observed as a picture and as the full simulator state,
-so that a planner may look only at pictures while an evaluation restores any recorded state exactly.
+The current state and the goal state of a scene are both observed as a picture and as the full simulator state: planners
+use the pictures, and an evaluation restores any recorded state exactly.
 """
 
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from torchrl_ficreg.keys import GOAL_PIXELS, PIXELS, STATE, SUCCESS
+from torchrl_ficreg.keys import GOAL_PIXELS, GOAL_STATE, PIXELS, STATE, SUCCESS
 
-GOAL_STATE = "goal_state"
-_LARGEST_ACTION = 100.0  # a hundred times what all environments ask for; physics would leave their states beyond
+_LARGEST_ACTION = 100.0  # a hundred times the bounds of all environments; larger ones would make states illegal
 
 
-class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
+class PixelGoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
     """Base class of goal-conditioned environments with pictures and restorable states.
 
     Observation: ``pixels`` and ``goal_pixels`` [3, image_size, image_size] uint8, ``state`` and ``goal_state`` [S]
     float64. Reward: 1 when the goal is reached, 0 otherwise. Info: ``success`` [1] bool, at reset too. An episode
-    terminates at success if asked to and is never truncated here: limits are a wrapper's business.
+    terminates at success if ``terminate_on_success``, and is never truncated here: time limits are set by a wrapper.
 
-    ``reset(options={"state": s, "goal_state": g})`` starts from exactly these states; either may be left out and is
-    then drawn from the task's own distribution.
+    ``reset(options={"state": s, "goal_state": g})`` starts from exactly these states; one that is left out is drawn
+    from the task's distribution.
 
-    A subclass sets ``action_space`` and ``state_space`` before it calls this constructor, and writes seven short
+    A subclass sets ``action_space`` and ``state_space`` before it calls this constructor, and implements seven
     methods: :meth:`_sample_state`, :meth:`_sample_goal`, :meth:`_get_state`, :meth:`_set_state`,
-    :meth:`_step_physics`, :meth:`_draw` and :meth:`_is_success`. It may refuse states by :meth:`_why_illegal`, and a
-    simulator that already is in the state to be drawn saves a restoration by :meth:`_draw_current`.
+    :meth:`_step_physics`, :meth:`_draw` and :meth:`_is_success`. It may refuse states by :meth:`_why_illegal`, and
+    override :meth:`_draw_current` where drawing the simulator's present state needs no restoration.
 
     Args:
-        image_size: height and width of the pictures, in pixels.
-        terminate_on_success: end the episode once the goal is reached.
-        render_mode: ``"rgb_array"``, or None where ``render`` is not used.
+        image_size (int, optional): height and width of the pictures, in pixels. Default: ``64``.
+        terminate_on_success (bool, optional): end the episode once the goal is reached. Default: ``True``.
+        render_mode (str, optional): ``"rgb_array"``, or None if ``render`` is not used. Default: ``"rgb_array"``.
 
     Raises:
         ValueError: an argument out of range.
@@ -45,7 +44,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
-    #: bounds of the action, which the physics may or may not enforce
+    #: bounds of the action; whether the physics clips to them depends on the environment
     action_space: spaces.Box
     #: bounds of the full simulator state, [S] float64
     state_space: spaces.Box
@@ -55,7 +54,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         *,
         image_size: int = 64,
         terminate_on_success: bool = True,
-        render_mode: str | None = "rgb_array",
+        render_mode: Literal["rgb_array"] | None = "rgb_array",
     ) -> None:
         if not isinstance(image_size, (int, np.integer)) or isinstance(image_size, bool) or image_size < 1:
             raise ValueError(f"image_size must be a positive integer, got {image_size!r}.")
@@ -83,7 +82,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
 
     @abc.abstractmethod
     def _get_state(self) -> np.ndarray:
-        """Returns the full simulator state, [S] float64, as an array that later steps leave alone."""
+        """Returns the full simulator state, [S] float64, as an array that later steps do not change."""
 
     @abc.abstractmethod
     def _set_state(self, state: np.ndarray) -> None:
@@ -95,18 +94,18 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
 
     @abc.abstractmethod
     def _draw(self, state: np.ndarray) -> np.ndarray:
-        """Draws the scene at ``state`` [S] into a new [3, image_size, image_size] uint8; leaves the simulator alone."""
+        """Draws the scene at ``state`` [S] into a new [3, image_size, image_size] uint8, without changing the simulator."""
 
     @abc.abstractmethod
     def _is_success(self, state: np.ndarray, goal_state: np.ndarray) -> bool:
-        """Tells whether ``state`` [S] reaches ``goal_state`` [S]."""
+        """Whether ``state`` [S] reaches ``goal_state`` [S]."""
 
     def _draw_current(self) -> np.ndarray:
-        """Draws the simulator as it stands into a new [3, image_size, image_size] uint8."""
+        """Draws the simulator's present state into a new [3, image_size, image_size] uint8."""
         return self._draw(self._get_state())
 
     def _why_illegal(self, state: np.ndarray) -> str | None:
-        """Says why an episode cannot start or end at ``state`` [S], or returns None; the bounds by default."""
+        """The reason why an episode cannot start or end at ``state`` [S], or None; checks the bounds by default."""
         if np.all(state >= self.state_space.low) and np.all(state <= self.state_space.high):
             return None
         return f"it leaves the bounds {self.state_space.low.tolist()} to {self.state_space.high.tolist()}"
@@ -119,11 +118,12 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         """Starts an episode.
 
         Args:
-            seed: makes the draws of this and of the following resets reproducible.
-            options: ``"state"`` and ``"goal_state"``, [S] each, to start from and to reach; bit for bit when float64.
+            seed (int, optional): seeds the draws of this and of the following resets. Default: ``None``.
+            options (dict, optional): ``"state"`` and ``"goal_state"``, [S] each, to start from and to reach; restored
+                bit for bit when float64. Default: ``None``.
 
         Returns:
-            the observation and the info, see the class.
+            observation and info, see the class.
 
         Raises:
             ValueError: unknown options, or a state of the wrong shape, not finite or not legal.
@@ -139,7 +139,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         goal = given[GOAL_STATE] if GOAL_STATE in given else self._sample_goal(self.np_random, state)
         self._set_state(state)
         self._goal_state = goal
-        self._goal_pixels = self._draw(goal)  # the goal stays for the whole episode: one drawing is enough
+        self._goal_pixels = self._draw(goal)  # drawn once per episode
         return self._observe(), self._info(self._is_success(self._get_state(), goal))
 
     def step(
@@ -148,7 +148,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         """Takes one action.
 
         Args:
-            action: [A], finite and within +-100; what happens beyond the bounds is the physics' business.
+            action (np.ndarray): [A], finite and within +-100; actions beyond the bounds are passed to the physics.
 
         Returns:
             observation, reward, terminated, truncated (always False) and info, see the class.
@@ -163,7 +163,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         if action.shape != self.action_space.shape:
             raise ValueError(f"action must be {self.action_space.shape}, got {action.shape}: step takes one action.")
         if not np.isfinite(action).all():
-            raise ValueError(f"action must be finite, got {action.tolist()}: look for the NaN in the policy.")
+            raise ValueError(f"action must be finite, got {action.tolist()}: look for a NaN in the policy.")
         if np.abs(action).max() > _LARGEST_ACTION:
             raise ValueError(
                 f"action must be within +-{_LARGEST_ACTION:.0f}, got {action.tolist()}: the bounds are "
@@ -175,11 +175,11 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         return self._observe(), float(success), terminated, False, self._info(success)
 
     def check_state(self, name: str, value: Any) -> np.ndarray:
-        """Checks a state that an episode is to begin or end at, and changes nothing.
+        """Checks a start or goal state; the environment is not changed.
 
         Args:
-            name: of the state, for messages.
-            value: [S].
+            name (str): name of the state in messages.
+            value (array-like): [S].
 
         Returns:
             the state, [S] float64, a copy.
@@ -187,7 +187,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         Raises:
             ValueError: a wrong shape, not finite, or not legal.
         """
-        state = np.array(value, dtype=np.float64)  # a copy: the caller's array stays his
+        state = np.array(value, dtype=np.float64)  # a copy: the caller may write to its array
         if state.shape != self.state_space.shape:
             raise ValueError(f"option {name!r} must have shape {self.state_space.shape}, got {state.shape}.")
         if not np.isfinite(state).all():
@@ -198,7 +198,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         return state
 
     def render(self) -> np.ndarray | None:
-        """Draws the scene for people and videos.
+        """Draws the scene with the channels last, for videos.
 
         Returns:
             [image_size, image_size, 3] uint8, or None without a render mode.
@@ -210,7 +210,7 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
     # ------------------------------------------------------------------ internals
 
     def _observe(self) -> dict[str, np.ndarray]:
-        # Copies of the goal: what a caller writes into an observation must not reach the next one.
+        # Copies of the goal: a caller may write into an observation without changing the next one.
         return {
             PIXELS: self._draw_current(),
             GOAL_PIXELS: self._goal_pixels.copy(),

@@ -1,4 +1,4 @@
-"""From a name to a TorchRL environment that speaks the package's key contract."""
+"""TorchRL environments by name, with the keys of the package."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl.data import Binary, Composite
 from torchrl.envs import EnvBase, GymWrapper, SerialEnv
 from torchrl.envs.gym_like import default_info_dict_reader
 
-from torchrl_ficreg.envs.base import GoalEnv
+from torchrl_ficreg.envs.base import PixelGoalEnv
 from torchrl_ficreg.envs.batched import WorkerGroupsEnv
 from torchrl_ficreg.envs.registry import find_entry
 from torchrl_ficreg.keys import STATE, SUCCESS
@@ -22,21 +22,22 @@ _TORCHRL_STATE = "observation"  # what GymWrapper calls an observation named "st
 
 
 class GoalGymWrapper(GymWrapper):
-    """TorchRL's view of a :class:`~torchrl_ficreg.envs.base.GoalEnv`, with the key names of the package.
+    """A :class:`~torchrl_ficreg.envs.base.PixelGoalEnv` as a TorchRL environment, with the keys of the package.
 
     Root keys: ``pixels`` and ``goal_pixels`` [3, H, W] uint8, ``state`` and ``goal_state`` [S] float64, ``success``
-    [1] bool, at resets too. TorchRL renames an observation called ``state``; this class keeps its name.
+    [1] bool, at resets too. ``GymWrapper`` renames an observation called ``state``; this class keeps its name.
 
     Args:
-        env: a Gymnasium environment, wrapped or not, around a :class:`~torchrl_ficreg.envs.base.GoalEnv`.
+        env (gymnasium.Env): a :class:`~torchrl_ficreg.envs.base.PixelGoalEnv`, wrapped or not.
+        **kwargs: of ``GymWrapper``.
 
     Raises:
         TypeError: another kind of environment.
     """
 
     def __init__(self, env: gymnasium.Env, **kwargs: Any) -> None:
-        if not isinstance(env.unwrapped, GoalEnv):
-            raise TypeError(f"expected a GoalEnv, got {type(env.unwrapped).__name__}: subclass GoalEnv.")
+        if not isinstance(env.unwrapped, PixelGoalEnv):
+            raise TypeError(f"expected a PixelGoalEnv, got {type(env.unwrapped).__name__}: subclass PixelGoalEnv.")
         super().__init__(env=env, **kwargs)
         spec = Composite({SUCCESS: Binary(n=1, shape=(1,), dtype=torch.bool)})
         self.set_info_dict_reader(default_info_dict_reader([SUCCESS], spec=spec))
@@ -48,7 +49,7 @@ class GoalGymWrapper(GymWrapper):
         self.observation_spec = Composite(specs, shape=self.observation_spec.shape)
 
     def read_obs(self, observations: dict[str, Any]) -> dict[str, torch.Tensor]:
-        """Turns the arrays of an observation into tensors under their own names; contiguous ones are not copied."""
+        """Converts the arrays of an observation to tensors under the same names; contiguous ones are not copied."""
         return {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in observations.items()}
 
 
@@ -63,32 +64,36 @@ def make_env(
     seed: int | None = None,
     **env_kwargs: Any,
 ) -> EnvBase:
-    """Builds one environment or a batch of them.
+    """Builds one environment or a batch of environments.
 
-    A batch is reset to given scenes by one dictionary per environment::
+    A batch is reset to given states by one dictionary per environment::
 
         env.reset(list_of_kwargs=[{"options": {"state": s, "goal_state": g}} for s, g in pairs])
 
     Args:
-        name: a short name of :data:`~torchrl_ficreg.envs.registry.ENVIRONMENTS`, or any Gymnasium id whose
-            environment is a :class:`~torchrl_ficreg.envs.base.GoalEnv`.
-        num_envs: 1 for an environment without batch dimension, more for one of batch size [num_envs].
-        image_size: height and width of the pictures, in pixels.
-        terminate_on_success: end an episode once its goal is reached.
-        max_episode_steps: truncate after so many steps; None for no limit.
-        num_workers: None to step the batch in this process; W for W processes with one thread each, among which the
-            environments are divided evenly. Same results bit for bit; it pays when drawing is slow, one process per
-            core. A script then needs the usual ``if __name__ == "__main__":``. A single environment always lives in
-            this process.
-        seed: makes the environments' draws reproducible; each environment of a batch gets its own seed from it.
-        **env_kwargs: passed to the environment's constructor.
+        name (str, optional): a short name of :data:`~torchrl_ficreg.envs.registry.ENVIRONMENTS` (``"two_room"``,
+            ``"push_t"``, ``"reacher"``, ``"cube"``), or any Gymnasium id of a
+            :class:`~torchrl_ficreg.envs.base.PixelGoalEnv`. Default: ``"two_room"``.
+        num_envs (int, optional): 1 for an environment without batch dimension, more for one of batch size [num_envs].
+            Default: ``1``.
+        image_size (int, optional): height and width of the pictures, in pixels. Default: ``64``.
+        terminate_on_success (bool, optional): end an episode once its goal is reached. Default: ``True``.
+        max_episode_steps (int, optional): number of steps after which an episode is truncated. Default: ``None``, no
+            limit.
+        num_workers (int, optional): W processes with one thread each, among which the environments of a batch are
+            divided evenly; the results are the same bit for bit. Use one process per core when drawing is slow. A
+            script then needs ``if __name__ == "__main__":``. A single environment is always in this process. Default:
+            ``None``, the batch is stepped in this process.
+        seed (int, optional): seeds the environments' draws; each environment of a batch has a seed of its own derived
+            from it. Default: ``None``.
+        **env_kwargs: of the environment's constructor.
 
     Returns:
         the environment; root keys as in :class:`GoalGymWrapper`.
 
     Raises:
         ValueError: an unknown name, or a number out of range.
-        TypeError: the environment is not a :class:`~torchrl_ficreg.envs.base.GoalEnv`.
+        TypeError: the environment is not a :class:`~torchrl_ficreg.envs.base.PixelGoalEnv`.
 
     Examples:
         >>> env = make_env("two_room", num_envs=2, seed=0)
@@ -132,5 +137,5 @@ def _make_single(gym_spec: EnvSpec, max_episode_steps: int | None, **kwargs: Any
 
 
 def _gym_spec(name: str) -> EnvSpec:
-    """The whole entry, not its id: a worker process has not seen what the caller registered."""
+    """The whole spec, not the id: a worker process does not have the ids that the caller registered."""
     return gymnasium.spec(name if name in gymnasium.registry else find_entry(name).gym_id)

@@ -1,4 +1,8 @@
-"""The table of environments. One more environment is one more entry here; nothing is imported until it is used."""
+"""The table of environments: an entry names an environment, its Gymnasium id and its expert.
+
+A new environment is a folder with a :class:`~torchrl_ficreg.envs.base.PixelGoalEnv` and an :class:`Expert`, and an entry
+here. Entries hold places as strings, so that nothing is imported before it is used.
+"""
 
 from __future__ import annotations
 
@@ -10,34 +14,46 @@ from typing import Any, Protocol
 import gymnasium
 import numpy as np
 
-from torchrl_ficreg.envs.base import GoalEnv
+from torchrl_ficreg.envs.base import PixelGoalEnv
 
 
 class Expert(Protocol):
-    """A policy that records data: it sees the full state and the goal, and keeps what it remembers to itself."""
+    """A policy that records data from the full state and the goal state.
+
+    A new expert is built for each episode, by ``expert(rng=generator, env=env, **expert_kwargs)``. It draws all its
+    random numbers from ``rng``, a ``np.random.Generator``, and may keep a memory between the steps of the episode. It
+    may read the scene of ``env``, an :class:`~torchrl_ficreg.envs.base.PixelGoalEnv`, and must not step or reset it. It
+    must not modify the arrays it is given.
+
+    Examples:
+        >>> class Noise:
+        ...     def __init__(self, *, rng, env, std=1.0):
+        ...         self.rng, self.size, self.std = rng, env.action_space.shape, std
+        ...     def __call__(self, state, goal_state):
+        ...         return self.rng.normal(0.0, self.std, self.size).clip(-1, 1).astype(np.float32)
+    """
 
     def __call__(self, state: np.ndarray, goal_state: np.ndarray) -> np.ndarray:
         """Chooses the next action.
 
         Args:
-            state: [S] float64.
-            goal_state: [S] float64.
+            state (np.ndarray): [S] float64.
+            goal_state (np.ndarray): [S] float64.
 
         Returns:
-            [A] float32.
+            [A] float32, in environment units.
         """
 
 
 @dataclass(frozen=True)
 class EnvEntry:
-    """Where to find the parts of one environment; places are written ``"module:attribute"``.
+    """The parts of one environment; places are written ``"module:attribute"``.
 
     Attributes:
-        gym_id: its Gymnasium id.
-        entry_point: the :class:`~torchrl_ficreg.envs.base.GoalEnv` subclass.
-        expert: the :class:`Expert` that records its data, built anew for each episode as ``expert(rng=generator,
-            env=env, **expert_kwargs)``; the environment is there to be asked about its scene, not to be stepped.
-        max_episode_steps: the time limit of ``gymnasium.make(gym_id)``.
+        gym_id: the Gymnasium id.
+        entry_point: place of the :class:`~torchrl_ficreg.envs.base.PixelGoalEnv` subclass.
+        expert: place of the :class:`Expert` that records its data.
+        max_episode_steps: time limit of ``gymnasium.make(gym_id)``, in steps.
     """
 
     gym_id: str
@@ -45,7 +61,7 @@ class EnvEntry:
     expert: str
     max_episode_steps: int
 
-    def load_env(self) -> type[GoalEnv]:
+    def load_env(self) -> type[PixelGoalEnv]:
         """Imports the environment class."""
         return _load(self.entry_point)
 
@@ -88,13 +104,13 @@ ENVIRONMENTS: dict[str, EnvEntry] = {
 
 
 def find_entry(name: str) -> EnvEntry:
-    """Looks an environment of this package up.
+    """Finds the entry of an environment of this package.
 
     Args:
-        name: its short name or its Gymnasium id.
+        name (str): short name or Gymnasium id.
 
     Returns:
-        its entry.
+        the entry.
 
     Raises:
         ValueError: no such environment.

@@ -12,12 +12,12 @@ pytest.importorskip("ogbench", reason="the cube is simulated by ogbench: pip ins
 
 from torchrl_ficreg.envs.cube import CubeArm, CubeEnv, CubeExpert, sample_goal, sample_start
 from torchrl_ficreg.envs.cube.physics import CUBE_POSITION
-from torchrl_ficreg.envs.cube.tasks import position_reached
+from torchrl_ficreg.envs.cube.tasks import is_success
 
 
 @pytest.fixture(scope="module")
 def shares():
-    path = Path(__file__).parents[3] / "sota-check" / "cube_pair_shares.py"
+    path = Path(__file__).parents[3] / "tools" / "published" / "cube_pair_shares.py"
     spec = importlib.util.spec_from_file_location("cube_pair_shares", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -46,7 +46,7 @@ def episode(arm, steps, **arguments):
 def test_without_noise_it_carries_the_cube_to_the_goal_and_puts_it_back_there_again(arm):
     """A plan takes 4.4 s, 88 steps, give or take: the second one lifts the cube where it lies."""
     states, actions, goal = episode(arm, 200, noise_std=0.0)
-    near = position_reached(states, goal)
+    near = is_success(states, goal)
     assert not near[0]
     assert 50 < near.argmax() < 90
     assert near[100]
@@ -57,7 +57,7 @@ def test_without_noise_it_carries_the_cube_to_the_goal_and_puts_it_back_there_ag
     assert np.abs(actions).max() <= 1
 
 
-def test_a_seed_fixes_the_bits_and_the_global_generator_is_put_back(arm):
+def test_the_global_generator_is_restored_and_has_no_influence(arm):
     np.random.seed(7)
     expected = np.random.random(3)
     runs = []
@@ -71,7 +71,7 @@ def test_a_seed_fixes_the_bits_and_the_global_generator_is_put_back(arm):
     assert runs[0].dtype == np.float32
 
 
-def test_the_environment_it_is_given_only_answers_questions(arm):
+def test_its_environment_does_not_change_its_actions(arm):
     """The same actions with the simulator it acts in and with one of its own."""
     env = CubeEnv(image_size=8)
     own = episode(arm, 30, rng=np.random.default_rng(1))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torchrl_ficreg.envs.cube.physics import CUBE_POSITION, CUBE_ROTATION, STATE_SIZE, yaw_rotation
-from torchrl_ficreg.envs.cube.tasks import cube_angle, pose_reached, position_reached
+from torchrl_ficreg.envs.cube.tasks import cube_angle, is_success
 
 
 def matrix(quaternion):
@@ -66,14 +66,14 @@ def test_a_cube_on_the_floor_repeats_every_quarter_turn():
 
 
 def test_the_published_rule_is_four_centimetres_in_three_dimensions_however_turned():
-    assert position_reached(lying(yaw=45), lying(x=0.4399))
-    assert not position_reached(lying(), lying(x=0.4401))
-    assert not position_reached(lying(), lying(x=0.43, z=0.05))  # 3 cm along and 3 cm up
-    assert position_reached(np.stack([lying(), lying(x=0.5)]), lying()).tolist() == [True, False]
+    assert is_success(lying(yaw=45), lying(x=0.4399))
+    assert not is_success(lying(), lying(x=0.4401))
+    assert not is_success(lying(), lying(x=0.43, z=0.05))  # 3 cm along and 3 cm up
+    assert is_success(np.stack([lying(), lying(x=0.5)]), lying()).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(("x", "yaw", "reached"), [
     (0.4299, 0, True), (0.4301, 0, False), (0.4, 14.9, True), (0.4, 15.1, False), (0.4, 104.9, True), (0.4, 45, False),
 ])
 def test_the_pose_rule_is_three_centimetres_and_fifteen_degrees(x, yaw, reached):
-    assert pose_reached(lying(x=x, yaw=yaw), lying()) == reached
+    assert is_success(lying(x=x, yaw=yaw), lying(), success_on="pose") == reached

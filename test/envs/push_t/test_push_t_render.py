@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_ficreg.envs.push_t.render import render
+from torchrl_ficreg.envs.push_t.render import render_pixels
 
-# Made from the published package by sota-check/make_golden_push_t.py.
+# Made from the published package by test/envs/push_t/golden/make_push_t.py.
 GOLDEN = Path(__file__).parent / "golden" / "push_t.npz"
 AWAY = [2000.0, 2000.0, 2000.0, 2000.0, 0.0, 0.0, 0.0]  # agent and block out of the picture
 
@@ -34,7 +34,7 @@ def test_pictures_differ_from_the_published_ones_by_less_than_half_a_grey_level(
     """0.40 over 300 scenes: 0.19 from aliased edges on whole pixels, the rest from bilinear against area resizing."""
     golden = np.load(GOLDEN)
     states, published = golden["state"], golden["pixels"]
-    ours = render(states, size=224)
+    ours = render_pixels(states, size=224)
     assert difference(ours, published).mean() < 0.45
     assert difference(ours, published).max() < 0.55
     errors = np.abs(ours.astype(float) - published)
@@ -49,14 +49,14 @@ def test_nothing_is_displaced_against_the_published_picture(axis):
     for shift in (-1.0, 0.0, 1.0):
         moved = golden["state"].copy()
         moved[:, axis] += shift
-        differences.append(difference(render(moved, size=224), golden["pixels"]).mean())
+        differences.append(difference(render_pixels(moved, size=224), golden["pixels"]).mean())
     assert np.argmin(differences) == 1
 
 
 def test_flat_parts_have_the_published_colours():
     """The pixels of the golden pictures whose neighbourhood is of one colour: ours have that colour too."""
     golden = np.load(GOLDEN)
-    published, ours = golden["pixels"].astype(int), render(golden["state"], size=224).astype(int)
+    published, ours = golden["pixels"].astype(int), render_pixels(golden["state"], size=224).astype(int)
     windows = np.lib.stride_tricks.sliding_window_view(published, (5, 5), axis=(2, 3))
     flat = (np.ptp(windows, axis=(4, 5)) == 0).all(1)  # [N, 220, 220]
     seen = published[:, :, 2:-2, 2:-2].transpose(0, 2, 3, 1)[flat]
@@ -69,36 +69,36 @@ def test_flat_parts_have_the_published_colours():
 
 def test_the_agent_covers_the_block_and_walls_cover_everything():
     state = np.array([300.0, 300.0, 300.0, 260.0, 0.0, 0.0, 0.0])
-    assert render(state, size=512)[:, 300, 300].tolist() == [78, 126, 255]
-    on_wall = render(np.array([5.0, 100.0, 300.0, 300.0, 0.0, 0.0, 0.0]), size=512)
+    assert render_pixels(state, size=512)[:, 300, 300].tolist() == [78, 126, 255]
+    on_wall = render_pixels(np.array([5.0, 100.0, 300.0, 300.0, 0.0, 0.0, 0.0]), size=512)
     assert on_wall[:, 100, 5].tolist() == [211, 211, 211]
     assert on_wall[:, 100, 12].tolist() == [78, 126, 255]
 
 
-def test_only_the_first_five_numbers_are_seen():
+def test_velocities_are_not_drawn():
     states = scenes(3)
     still = states.copy()
     still[:, 5:] = 0
-    assert (render(states, size=64) == render(still, size=64)).all()
+    assert (render_pixels(states, size=64) == render_pixels(still, size=64)).all()
 
 
 def test_the_green_t_can_be_left_out():
-    green = (render(np.array(AWAY), size=64) == np.array([144, 238, 144])[:, None, None]).all(0)
+    green = (render_pixels(np.array(AWAY), size=64) == np.array([144, 238, 144])[:, None, None]).all(0)
     assert green.sum() > 50
-    bare = render(np.array(AWAY), size=64, draw_goal=False)
+    bare = render_pixels(np.array(AWAY), size=64, draw_goal=False)
     assert (bare[:, green] == 255).all()
 
 
 def test_the_green_t_has_no_seam():
     """Its pixels inside are pure, where bar and stem meet too: window pixel (256 - 21, 256 + 21) is on that line."""
-    assert render(np.array(AWAY), size=512)[:, 277, 235].tolist() == [144, 238, 144]
+    assert render_pixels(np.array(AWAY), size=512)[:, 277, 235].tolist() == [144, 238, 144]
 
 
 def test_agent_and_block_may_be_partly_or_fully_outside():
-    empty = render(np.array(AWAY), size=64)
+    empty = render_pixels(np.array(AWAY), size=64)
     for x in (-172.0, -20.0, 1e4):
-        assert (render(np.array([x, 256.0, *AWAY[2:]]), size=64) == empty).all()
-    half = render(np.array([0.0, 256.0, 512.0, 256.0, 1.0, 0.0, 0.0]), size=64)
+        assert (render_pixels(np.array([x, 256.0, *AWAY[2:]]), size=64) == empty).all()
+    half = render_pixels(np.array([0.0, 256.0, 512.0, 256.0, 1.0, 0.0, 0.0]), size=64)
     assert (half != empty).any()
 
 
@@ -108,9 +108,9 @@ def test_agent_and_block_may_be_partly_or_fully_outside():
 @pytest.mark.parametrize("size", [16, 64, 128])
 def test_a_small_picture_is_the_area_average_of_a_large_one(size):
     states, fold = scenes(12), 1024 // size
-    large = render(states, size=1024).astype(float)
+    large = render_pixels(states, size=1024).astype(float)
     average = large.reshape(12, 3, size, fold, size, fold).mean((3, 5))
-    errors = np.abs(render(states, size=size) - average)
+    errors = np.abs(render_pixels(states, size=size) - average)
     assert errors.mean() < 0.1  # of 255 grey levels; rounding alone may make 0.25 in non-flat parts
     assert np.quantile(errors, 0.999) < 4
 
@@ -120,40 +120,40 @@ def test_pictures_move_smoothly(size):
     """A thousandth of a pixel of the window changes no grey level by more than one."""
     states = scenes(5)
     moved = states + 1e-3 * np.array([1, 1, 1, 1, 0.01, 0, 0])
-    assert np.abs(render(states, size=size).astype(int) - render(moved, size=size)).max() <= 1
+    assert np.abs(render_pixels(states, size=size).astype(int) - render_pixels(moved, size=size)).max() <= 1
 
 
 @pytest.mark.parametrize("size", [8, 64, 224])
 def test_batches_equal_single_pictures_to_the_bit(size):
     states = scenes(6)
-    batch = render(states.reshape(2, 3, 7), size=size)
+    batch = render_pixels(states.reshape(2, 3, 7), size=size)
     assert batch.shape == (2, 3, 3, size, size)
     assert batch.dtype == np.uint8
     for state, picture in zip(states, batch.reshape(6, 3, size, size), strict=True):
-        assert (render(state, size=size) == picture).all()
+        assert (render_pixels(state, size=size) == picture).all()
 
 
 def test_pictures_belong_to_the_caller_and_states_are_left_alone():
     states = scenes(1)
     given = states.copy()
-    first = render(states, size=32)
+    first = render_pixels(states, size=32)
     kept = first.copy()
     first[:] = 0
-    assert (render(states, size=32) == kept).all()
+    assert (render_pixels(states, size=32) == kept).all()
     assert (states == given).all()
 
 
-def test_tensors_and_empty_batches_are_welcome():
+def test_tensors_and_empty_batches_are_accepted():
     states = scenes(2)
-    assert (render(torch.from_numpy(states), size=32) == render(states, size=32)).all()
-    assert render(np.empty((0, 7)), size=32).shape == (0, 3, 32, 32)
+    assert (render_pixels(torch.from_numpy(states), size=32) == render_pixels(states, size=32)).all()
+    assert render_pixels(np.empty((0, 7)), size=32).shape == (0, 3, 32, 32)
 
 
 def test_bad_arguments_are_refused():
     with pytest.raises(ValueError, match=r"states must be \[..., 7\], got \(5,\)"):
-        render(np.zeros(5))
+        render_pixels(np.zeros(5))
     with pytest.raises(ValueError, match="states must be finite"):
-        render(np.full(7, np.nan))
+        render_pixels(np.full(7, np.nan))
     for size in (0, 2.5):
         with pytest.raises(ValueError, match=f"size must be a positive integer, got {size}"):
-            render(np.zeros(7), size=size)
+            render_pixels(np.zeros(7), size=size)

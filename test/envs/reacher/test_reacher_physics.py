@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 
 import numpy as np
 import pytest
 
-from torchrl_ficreg.envs._gl import import_mujoco, import_simulator
-from torchrl_ficreg.envs.reacher import physics
+from torchrl_ficreg.envs._gl import import_mujoco
+from torchrl_ficreg.envs.reacher import physics, tasks
 
 for name in ("mujoco", "dm_control"):
     if importlib.util.find_spec(name) is None:
@@ -36,19 +37,19 @@ def test_the_numbers_of_the_arm(model):
     assert model.body_mass[1:].round(4).tolist() == [0.0419, 0.0356, 0.0042]
 
 
-def test_contacts_are_off_and_the_solver_remembers_nothing(model):
+def test_contacts_and_warm_starts_are_off(model):
     flags = import_mujoco().mjtDisableBit
     assert model.opt.disableflags & int(flags.mjDSBL_CONTACT)
     assert model.opt.disableflags & int(flags.mjDSBL_WARMSTART)
 
 
-def test_it_moves_as_dm_controls(model):
-    """1200 control steps, torques beyond +-1 and stops included; the solver's memory is worth 1e-12 by then."""
+def test_it_moves_as_in_dm_control(model):
+    """1200 control steps, torques beyond +-1 and stops included; the warm start is worth 1e-12 by then."""
     mujoco = import_mujoco()
-    stock = import_simulator("dm_control.suite.reacher").hard(random=0).physics
+    stock = importlib.import_module("dm_control.suite.reacher").hard(random=0).physics
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
-    data.qpos[:] = stock.data.qpos[:] = physics.sample_state(rng)[:2]
+    data.qpos[:] = stock.data.qpos[:] = tasks.sample_state(rng)[:2]
     stock.forward()
     touched = 0
     for _ in range(600):
@@ -88,7 +89,7 @@ def test_the_stop_yields_less_than_the_slack_to_the_strongest_push(model):
 def test_starts_are_uniform_and_at_rest():
     """Means 0 and standard deviations of the uniform law, width / sqrt(12), within 4 standard errors."""
     rng = np.random.default_rng(0)
-    states = np.stack([physics.sample_state(rng) for _ in range(4000)])
+    states = np.stack([tasks.sample_state(rng) for _ in range(4000)])
     assert not states[:, 2:].any()
     bounds = np.array([np.pi, physics.WRIST_LIMIT])
     assert (np.abs(states[:, :2]) <= bounds).all()
@@ -99,30 +100,30 @@ def test_starts_are_uniform_and_at_rest():
 def test_success_is_a_box_of_005_rad_whatever_the_velocity():
     goal = np.array([0.5, -1.0, 0.0, 0.0])
     inside = goal + [0.0499, -0.0499, 9.0, -9.0]
-    assert physics.is_success(inside, goal)
+    assert tasks.is_success(inside, goal)
     for joint in (0, 1):
         outside = inside.copy()
         outside[joint] += np.sign(inside[joint] - goal[joint]) * 0.0002
-        assert not physics.is_success(outside, goal)
+        assert not tasks.is_success(outside, goal)
 
 
 def test_only_the_shoulder_goes_around_and_only_if_wrapped():
     goal = np.array([3.12, 0.3, 0.0, 0.0])
     for turns in (-3, -1, 1, 2):
         turned = goal + [2 * np.pi * turns + 0.03, 0, 0, 0]  # crosses the seam at pi
-        assert physics.is_success(turned, goal)
-        assert not physics.is_success(turned, goal, wrap=False)
-    assert not physics.is_success(goal + [0, 2 * np.pi, 0, 0], goal)
+        assert tasks.is_success(turned, goal)
+        assert not tasks.is_success(turned, goal, wrap=False)
+    assert not tasks.is_success(goal + [0, 2 * np.pi, 0, 0], goal)
 
 
 def test_errors_of_a_batch_are_those_of_its_rows():
     rng = np.random.default_rng(0)
     states, goals = rng.normal(0, 5, (3, 7, 4)), rng.normal(0, 5, (3, 7, 4))
-    batch = physics.joint_error(states, goals)
+    batch = tasks.joint_error(states, goals)
     assert batch.shape == (3, 7, 2)
     assert (np.abs(batch[..., 0]) <= np.pi).all()
-    np.testing.assert_array_equal(batch[1, 2], physics.joint_error(states[1, 2], goals[1, 2]))
+    np.testing.assert_array_equal(batch[1, 2], tasks.joint_error(states[1, 2], goals[1, 2]))
     near = states + rng.normal(0, 0.05, states.shape)
-    solved = physics.is_success(states, near)
+    solved = tasks.is_success(states, near)
     assert 0 < solved.sum() < solved.size
-    assert solved[1, 2] == physics.is_success(states[1, 2], near[1, 2])
+    assert solved[1, 2] == tasks.is_success(states[1, 2], near[1, 2])

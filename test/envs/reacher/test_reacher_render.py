@@ -45,7 +45,7 @@ def start(env, state):
     return env.reset(options={"state": state, "goal_state": np.zeros(4)})[0]
 
 
-def test_the_picture_is_dm_controls(tmp_path):
+def test_the_picture_is_that_of_dm_control(tmp_path):
     """Against stock pictures of camera 0 at 224 px with a transparent target; drawn by another process."""
     np.save(tmp_path / "states.npy", STATES)
     files = [str(tmp_path / name) for name in ("states.npy", "pictures.npy")]
@@ -70,7 +70,7 @@ def test_colours_and_light_are_those_of_the_published_data(env):
     assert camera.fovy.item() == 45
 
 
-def test_the_finger_is_where_the_angles_say(env):
+def test_the_finger_is_drawn_at_the_position_of_the_angles(env):
     """Seen from 0.75 m at 45 degrees; the arm at height 0.01 m: x to the right, y up, from the centre."""
     still, bent = (start(env, state)["pixels"].astype(int) for state in ([0.0, 0, 0, 0], [0.0, np.pi / 2, 0, 0]))
     changed = np.abs(still - bent).sum(0) > 60
@@ -80,46 +80,14 @@ def test_the_finger_is_where_the_angles_say(env):
     assert not changed[:, :32].any()  # nothing to the left of the root
 
 
-def test_equal_states_give_equal_bits_whatever_was_drawn_before(env):
-    first = start(env, STATES[1])["pixels"]
-    start(env, STATES[2])
-    assert np.array_equal(start(env, STATES[1])["pixels"], first)
-    other = ReacherEnv(image_size=64)
-    assert np.array_equal(start(other, STATES[1])["pixels"], first)
-    other.close()
-
-
-def test_the_stored_frame_is_that_of_the_stored_state(env):
-    rng = np.random.default_rng(0)
-    start(env, STATES[0])
-    for _ in range(5):
-        observation = env.step(rng.uniform(-1, 1, 2))[0]
-        restored = start(env, observation["state"])
-        assert np.array_equal(restored["pixels"], observation["pixels"])
-
-
-def test_drawing_leaves_the_arm_alone(env):
-    start(env, STATES[1])
-    before = env._get_state()
-    env.render()
-    env._draw(STATES[2])
-    assert env._get_state().tobytes() == before.tobytes()
-
-
-def test_velocities_are_invisible_and_turns_too(env):
+def test_velocities_and_full_turns_are_not_drawn(env):
     still = start(env, [0.5, 1.0, 0.0, 0.0])["pixels"]
     assert np.array_equal(start(env, [0.5, 1.0, 3.0, -3.0])["pixels"], still)
     turned = start(env, [0.5 + 2 * np.pi, 1.0, 0.0, 0.0])["pixels"].astype(int)
     assert np.abs(turned - still).max() <= 1  # rounding of the angle
 
 
-def test_the_goal_picture_is_the_picture_at_the_goal(env):
-    observation, _ = env.reset(options={"state": STATES[0], "goal_state": STATES[1]})
-    assert np.array_equal(observation["goal_pixels"], start(env, STATES[1])["pixels"])
-    assert np.array_equal(env.render().transpose(2, 0, 1), start(env, STATES[1])["pixels"])
-
-
-def test_a_coarser_shadow_is_hardly_seen(env):
+def test_a_coarser_shadow_changes_little(env):
     coarse = ReacherEnv(image_size=64, shadow_size=512)
     pairs = [(start(env, state)["pixels"], start(coarse, state)["pixels"]) for state in STATES]
     coarse.close()

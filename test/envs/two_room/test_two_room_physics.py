@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_ficreg.envs.two_room.physics import in_wall, is_legal, is_success, step, TwoRoomGeometry
+from torchrl_ficreg.envs.two_room.physics import in_wall, is_legal, step, TwoRoomGeometry
+from torchrl_ficreg.envs.two_room.tasks import is_success
 
 RULES = ["swept", "endpoint"]
 
@@ -64,7 +65,7 @@ def test_the_door_lets_through_exactly_its_interval(collision, y, enters):
     assert moved([126, y], [-1, 0], collision) == [121 if enters else 124.5, y]
 
 
-def test_only_the_endpoint_rule_throws_an_agent_in_the_corridor_back():
+def test_only_the_endpoint_rule_moves_an_agent_in_the_corridor_back():
     """Published behaviour: leaving the door's interval inside the corridor costs up to 11.5 px."""
     assert moved([111, 64], [0, 1], "endpoint") == [99.5, 69]
     assert moved([113, 64], [0, 1], "endpoint") == [124.5, 69]
@@ -129,7 +130,7 @@ def test_mirrored_scenes_move_mirrored(collision):
 
 
 @pytest.mark.parametrize("shape", [(), (6,), (2, 3)])
-def test_batch_dimensions_and_dtype_are_free_and_inputs_stay(shape):
+def test_batch_dimensions_and_dtype_are_free_and_inputs_unchanged(shape):
     starts = torch.rand(*shape, 2) * 70 + 21
     actions = torch.rand(*shape, 2)
     before = starts.clone(), actions.clone()

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torchrl_ficreg.envs.two_room.render import background, render
+from torchrl_ficreg.envs.two_room.render import background, render_pixels
 
 AGENT = torch.tensor([60.0, 160.0], dtype=torch.float64)
 
@@ -25,7 +25,7 @@ def test_walls_door_and_border_lie_on_the_published_pixels():
 
 def test_the_agent_is_a_soft_red_disc_with_a_pure_centre():
     """alpha = exp(-d^2 / (2 * 7^2)); on white, red stays 255 and the others are 255 * (1 - alpha), truncated."""
-    picture = render(AGENT)
+    picture = render_pixels(AGENT)
     assert picture[:, 160, 60].tolist() == [255, 0, 0]
     seven_right = math.floor(255 * (1 - math.exp(-0.5)))  # 100
     assert picture[:, 160, 67].tolist() == [255, seven_right, seven_right]
@@ -34,7 +34,7 @@ def test_the_agent_is_a_soft_red_disc_with_a_pure_centre():
 
 
 def test_on_the_wall_the_disc_lifts_red_from_black():
-    picture = render(torch.tensor([99.5, 160.0]))
+    picture = render_pixels(torch.tensor([99.5, 160.0]))
     alpha = math.exp(-(10.5**2 - 0.25) / 98)  # column 110; divided by the alpha of the nearest column, 0.5 px away
     assert picture[:, 160, 110].tolist() == [math.floor(255 * alpha), 0, 0]
 
@@ -42,7 +42,7 @@ def test_on_the_wall_the_disc_lifts_red_from_black():
 @pytest.mark.parametrize("size", [64, 96, 224])
 def test_the_pixel_nearest_to_the_agent_is_pure_red_at_any_size(size):
     positions = 25 + 70 * torch.rand(50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    pictures = render(positions, size=size)
+    pictures = render_pixels(positions, size=size)
     column, row = ((positions + 0.5) * size / 224 - 0.5).round().long().unbind(-1)
     centre = pictures[torch.arange(50), :, row, column]
     assert centre.tolist() == [[255, 0, 0]] * 50
@@ -62,7 +62,7 @@ def test_the_disc_follows_the_agent_between_coarse_pixels():
     """At 64 px the centre of mass of the disc is where the agent is, to a tenth of a canvas pixel."""
     centers = (torch.arange(64, dtype=torch.float64) + 0.5) * 3.5 - 0.5
     for x in (58.0, 58.9, 60.3):
-        picture = render(torch.tensor([x, 160.0], dtype=torch.float64), size=64)
+        picture = render_pixels(torch.tensor([x, 160.0], dtype=torch.float64), size=64)
         ink = 255.0 - picture[1, 40:52, 8:26].double()
         found = (ink.sum(0) * centers[8:26]).sum() / ink.sum()
         assert abs(found - x) < 0.1
@@ -70,24 +70,24 @@ def test_the_disc_follows_the_agent_between_coarse_pixels():
 
 def test_batches_equal_single_pictures_and_keep_their_shape():
     positions = torch.rand(2, 300, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 180 + 21
-    pictures = render(positions, size=32)
+    pictures = render_pixels(positions, size=32)
     assert pictures.shape == (2, 300, 3, 32, 32)
     assert pictures.dtype == torch.uint8
-    assert torch.equal(pictures[1, 299], render(positions[1, 299], size=32))
-    assert torch.equal(pictures[0, 7], render(positions[0, 7], size=32))
+    assert torch.equal(pictures[1, 299], render_pixels(positions[1, 299], size=32))
+    assert torch.equal(pictures[0, 7], render_pixels(positions[0, 7], size=32))
 
 
 def test_the_goal_is_green_beneath_the_agent_and_absent_by_default():
     goal = torch.tensor([60.0, 40.0], dtype=torch.float64)
-    assert render(AGENT, goal=goal)[:, 40, 60].tolist() == [0, 255, 0]
-    assert render(AGENT, goal=AGENT)[:, 160, 60].tolist() == [255, 0, 0]
-    assert render(AGENT)[:, 40, 60].tolist() == [255, 255, 255]
+    assert render_pixels(AGENT, goal=goal)[:, 40, 60].tolist() == [0, 255, 0]
+    assert render_pixels(AGENT, goal=AGENT)[:, 160, 60].tolist() == [255, 0, 0]
+    assert render_pixels(AGENT)[:, 40, 60].tolist() == [255, 255, 255]
 
 
 def test_wrong_arguments_are_refused():
     with pytest.raises(ValueError, match="size must be a positive integer"):
-        render(AGENT, size=0)
+        render_pixels(AGENT, size=0)
     with pytest.raises(ValueError, match="position must be"):
-        render(torch.zeros(3))
+        render_pixels(torch.zeros(3))
     with pytest.raises(ValueError, match="goal must have the shape"):
-        render(AGENT, goal=torch.zeros(4, 2))
+        render_pixels(AGENT, goal=torch.zeros(4, 2))

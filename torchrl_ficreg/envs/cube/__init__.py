@@ -1,11 +1,18 @@
-"""Cube: a robot arm and a cube; simulator, meshes, pictures, tasks, expert and environment, each in its own file."""
+"""Cube: move a cube to another place with a robot arm.
+
+* ``env.py``: :class:`CubeEnv`
+* ``tasks.py``: starts, goals and the success rules
+* ``physics.py``: OGBench's arm in MuJoCo
+* ``render.py``: pictures
+* ``expert.py``: the policy that records data
+"""
 
 from __future__ import annotations
 
 from torchrl_ficreg.envs.cube.env import CubeEnv
 from torchrl_ficreg.envs.cube.expert import CubeExpert
 from torchrl_ficreg.envs.cube.physics import CubeArm
-from torchrl_ficreg.envs.cube.render import render
+from torchrl_ficreg.envs.cube.render import render_pixels
 from torchrl_ficreg.envs.cube.tasks import cube_angle, sample_goal, sample_start
 
-__all__ = ["CubeArm", "CubeEnv", "CubeExpert", "cube_angle", "render", "sample_goal", "sample_start"]
+__all__ = ["CubeArm", "CubeEnv", "CubeExpert", "cube_angle", "render_pixels", "sample_goal", "sample_start"]

@@ -1,39 +1,38 @@
-"""Cube: a robot arm that has to put a cube somewhere else."""
+"""The environment Cube: a robot arm moves a cube to another place."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, get_args, Literal
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from gymnasium import spaces
 
-from torchrl_ficreg.envs.base import GoalEnv
+from torchrl_ficreg.envs.base import PixelGoalEnv
 from torchrl_ficreg.envs.cube import tasks
 from torchrl_ficreg.envs.cube.physics import CUBE_POSITION, CUBE_ROTATION, CubeArm, STATE_SIZE
-from torchrl_ficreg.envs.cube.render import check_detail, Detail, render
-from torchrl_ficreg.envs.cube.tasks import pose_reached, position_reached
-
-SuccessRule = Literal["position", "pose"]
+from torchrl_ficreg.envs.cube.render import check_detail, Detail, render_pixels
+from torchrl_ficreg.envs.cube.tasks import SuccessRule
 
 _UNIT_SLACK = 1e-3  # of the length of a quaternion: recorded ones may have been stored as float32
 _LARGEST = 1e4  # of all positions and velocities, far beyond what the arm can do
 _FARTHEST = 2.0  # m from the foot of the arm, beyond anything it could throw a cube to
 
 
-class CubeEnv(GoalEnv):
+class CubeEnv(PixelGoalEnv):
     """OGBench's single cube as a goal-conditioned Gymnasium environment: UR5e arm, two-finger gripper, one red cube.
 
-    State: MuJoCo's 21 positions and 20 velocities, laid out in :mod:`torchrl_ficreg.envs.cube.tasks`. Action: [5] in
-    [-1, 1], shifts of the gripper by 0.05 m, a turn by 0.3 rad and a change of its opening by 1 per unit, see
-    :class:`~torchrl_ficreg.envs.cube.physics.CubeArm`; larger ones are not clipped, as published. One step takes 0.05 s.
-    Resets put the cube and its target anywhere in [0.3, 0.55] x [-0.3, 0.3] m, both turned at random, and the open
-    gripper 0.275 m above the middle of the table; the goal state shows the cube at rest at the target.
+    State: MuJoCo's 21 positions and 20 velocities, laid out in :mod:`torchrl_ficreg.envs.cube.physics`. Action: [5] in
+    [-1, 1], shifts of the gripper by 0.05 m, a rotation by 0.3 rad and a change of its opening by 1 per unit, see
+    :class:`~torchrl_ficreg.envs.cube.physics.CubeArm`; larger actions are not clipped, as published. One step lasts
+    0.05 s. Starts and goals have the cube anywhere in [0.3, 0.55] x [-0.3, 0.3] m at a random yaw, at rest, and the open
+    gripper 0.275 m above the middle of the table.
 
     Args:
-        success_on: ``"position"``, the published rule: the cube's centre is at most 0.04 m from the goal's, however
-            it is turned. ``"pose"``: at most 0.03 m and at most 15 degrees, the symmetries of the cube aside.
-        detail: of the pictures, see :func:`torchrl_ficreg.envs.cube.render.render`.
-        **kwargs: see :class:`torchrl_ficreg.envs.base.GoalEnv`.
+        success_on (str, optional): ``"position"``, the published rule, or ``"pose"``; see
+            :func:`torchrl_ficreg.envs.cube.tasks.is_success`. Default: ``"position"``.
+        detail (str, optional): of the pictures, ``"pixel"`` (fast) or ``"published"``; see
+            :func:`torchrl_ficreg.envs.cube.render.render_pixels`. Default: ``"pixel"``.
+        **kwargs: see :class:`torchrl_ficreg.envs.base.PixelGoalEnv`.
 
     Attributes:
         arm: the simulator.
@@ -79,11 +78,10 @@ class CubeEnv(GoalEnv):
         self.arm.step(action)
 
     def _draw(self, state: np.ndarray) -> np.ndarray:
-        return render(state, size=self.image_size, detail=self.detail)
+        return render_pixels(state, size=self.image_size, detail=self.detail)
 
     def _is_success(self, state: np.ndarray, goal_state: np.ndarray) -> bool:
-        reached = position_reached if self.success_on == "position" else pose_reached
-        return bool(reached(state, goal_state))
+        return bool(tasks.is_success(state, goal_state, success_on=self.success_on))
 
     def _why_illegal(self, state: np.ndarray) -> str | None:
         length = np.linalg.norm(state[CUBE_ROTATION])
@@ -93,7 +91,7 @@ class CubeEnv(GoalEnv):
                 "a state is qpos [21] followed by qvel [20]"
             )
         if np.abs(state).max() > _LARGEST:
-            return f"a number is beyond {_LARGEST:.0f}, where MuJoCo would start anew"
+            return f"a number is beyond {_LARGEST:.0f}, where MuJoCo would reset the simulation"
         position = state[CUBE_POSITION]
         if position[2] < 0 or np.abs(position).max() > _FARTHEST:
             return f"the cube is below the floor or more than {_FARTHEST} m away, at {position.tolist()}"

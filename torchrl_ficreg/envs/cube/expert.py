@@ -1,4 +1,4 @@
-"""An expert that picks the cube up, puts it down at the goal, and does so again until the episode ends."""
+"""Expert of Cube: picks the cube up and puts it down at the goal, repeatedly until the episode ends."""
 
 from __future__ import annotations
 
@@ -14,24 +14,26 @@ from torchrl_ficreg.envs.cube.physics import CubeArm, TIME_STEP
 class CubeExpert:
     """OGBench's plan oracle, seeded, with one goal per episode.
 
-    A plan leads the gripper over the cube, down, up, over the goal, down, up and to a random end, with random heights
-    and times, and correlated noise on top. Actions track it from the measured pose. When a plan ends, the next begins
-    with the same goal: from then on the cube is lifted and put back where it already is. This is how the published
-    data were recorded, where 38.4 % of the frames 25 steps apart show the cube within 4 cm of the same place.
+    A plan moves the gripper over the cube, down, up, over the goal, down, up and to a random end, with random heights
+    and times and temporally correlated noise. Actions track it from the measured pose. When a plan ends, the next
+    begins with the same goal: the cube is then lifted and put down at the same place. The published data were recorded
+    in this way; in 38.4 % of their frame pairs 25 steps apart the cube is within 4 cm of the same place.
 
-    It remembers its plan: one expert records one episode. Apart from that, an action depends on the state alone.
+    One object records one episode: it keeps its plan. Otherwise an action depends on the state alone.
 
     Args:
-        rng: the source of plans and their noise; a fixed one by default, so that equal calls give equal episodes.
-            NumPy's global generator, which the oracle draws from, is seeded from it and put back each time.
-        env: the :class:`~torchrl_ficreg.envs.cube.env.CubeEnv` it acts in; its simulator answers where the gripper is
-            in a state and is left alone otherwise. By default the expert has a simulator of its own.
-        noise_std: standard deviation of the noise of the plan, in units of the action.
-        noise_smoothing: standard deviation of the Gaussian that smooths the noise in time, in steps.
+        rng (np.random.Generator, optional): source of plans and their noise. NumPy's global generator, which the oracle
+            draws from, is seeded from it and restored each time. Default: ``np.random.default_rng(0)``.
+        env (CubeEnv, optional): the environment it acts in, whose simulator computes the gripper's pose at a state and
+            is not changed. Default: ``None``, a simulator of its own.
+        noise_std (float, optional): standard deviation of the noise of the plan, in units of the action. Default:
+            ``0.1``.
+        noise_smoothing (float, optional): standard deviation of the Gaussian that smooths the noise in time, in steps.
+            Default: ``0.5``.
 
     Raises:
         ValueError: ``noise_std`` is negative or ``noise_smoothing`` not positive.
-        TypeError: ``env`` is no CubeEnv.
+        TypeError: ``env`` is not a CubeEnv.
         ImportError: MuJoCo or ogbench is not installed.
 
     Examples:
@@ -69,14 +71,14 @@ class CubeExpert:
         """Chooses the next action.
 
         Args:
-            state: [41] float64.
-            goal_state: [41] float64, of which only the pose of the cube matters.
+            state (np.ndarray): [41] float64.
+            goal_state (np.ndarray): [41] float64, of which the pose of the cube is used.
 
         Returns:
             [5] float32 in [-1, 1].
         """
         goal = self._arm.measure(goal_state)
-        seen = {
+        observation = {
             **self._arm.measure(state),
             "time": np.array([self._steps * TIME_STEP]),
             "privileged/target_block": 0,
@@ -84,22 +86,22 @@ class CubeExpert:
             "privileged/target_block_yaw": goal["privileged/block_0_yaw"],
         }
         if self._steps == 0:
-            self._plan(seen)
-        action = self._oracle.select_action(None, seen)
+            self._plan(observation)
+        action = self._oracle.select_action(None, observation)
         if self._oracle.done:
-            # As published: the new plan begins where this action does, so the next one takes its second point.
-            self._plan(seen)
+            # As published: the new plan begins at the state of this action, so the next action takes its second point.
+            self._plan(observation)
         self._steps += 1
         return np.clip(action, -1.0, 1.0).astype(np.float32)
 
-    def _plan(self, seen: dict[str, Any]) -> None:
+    def _plan(self, observation: dict[str, Any]) -> None:
         with _seeded_global_generator(self._rng):
-            self._oracle.reset(None, seen)
+            self._oracle.reset(None, observation)
 
 
 @contextmanager
 def _seeded_global_generator(rng: np.random.Generator) -> Iterator[None]:
-    """Lets code that draws from NumPy's global generator draw from a seed of ``rng``, and hides that it did."""
+    """Seeds NumPy's global generator from ``rng`` within the context and restores its state afterwards."""
     before = np.random.get_state()
     np.random.seed(rng.integers(2**32, dtype=np.uint32))
     try:

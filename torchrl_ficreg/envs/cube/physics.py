@@ -1,12 +1,12 @@
-"""The UR5e arm and its cube, simulated and steered by the ``ogbench`` package.
+"""Physics of Cube: the UR5e arm and its cube, simulated and controlled by the ``ogbench`` package.
 
-Its model takes seconds to compile, so a process compiles it once, and every arm works on MuJoCo data of its own.
+The model takes seconds to compile, so a process compiles it once, and each :class:`CubeArm` has its own MuJoCo data.
 
-One step is a pure function of state and action. The published one is so up to rounding, although it does not look so:
-MuJoCo's body poses stay those at the beginning of the last substep, and its controller reads the pose of the gripper
-from them, 2 ms late. That late pose needs no memory: the integrator moves positions by the new velocities, so moving
-them back by the same velocities finds it again. What remains is the solver's initial guess, which published steps
-carry over and which starts at zero here.
+A step is a pure function of state and action. The published step is one up to rounding, with a hidden dependence:
+MuJoCo's body poses remain those at the beginning of the last substep, and the controller reads the pose of the gripper
+from them, 2 ms late. That late pose is recomputed from the state, because the integrator moves positions by the new
+velocities and moving them back by the same velocities restores it. The remaining difference is the solver's initial
+guess, which the published step carries over and which is zero here.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def compiled() -> Any:
     """Builds OGBench's single cube and compiles its two models, once per process.
 
     Returns:
-        ``ogbench.manipspace.envs.cube_env.CubeEnv``, to be copied and not to be stepped.
+        ``ogbench.manipspace.envs.cube_env.CubeEnv``, a template that is copied and never stepped.
 
     Raises:
         ImportError: MuJoCo or ogbench is not installed.
@@ -62,14 +62,13 @@ def compiled() -> Any:
 class CubeArm:
     """The simulator behind :class:`~torchrl_ficreg.envs.cube.env.CubeEnv`, without goals and pictures.
 
-    An action is five numbers: shifts of the gripper along x, y and z by 0.05 m per unit, a turn by 0.3 rad per unit
-    and a change of its opening by 1 per unit (positive closes). They are relative to the measured pose and nothing
-    clips them; the pose they lead to is clipped to the workspace, x in [0.25, 0.6], y in [-0.35, 0.35] and z in
-    [0.02, 0.35] m.
+    An action is five numbers: shifts of the gripper along x, y and z by 0.05 m per unit, a rotation by 0.3 rad per unit
+    and a change of its opening by 1 per unit (positive closes). They are relative to the measured pose and not clipped;
+    the resulting target pose is clipped to the workspace, x in [0.25, 0.6], y in [-0.35, 0.35] and z in [0.02, 0.35] m.
 
     Attributes:
-        model: the ``mujoco.MjModel``, shared by all arms of the process: not to be written to.
-        ogbench: the environment of the ``ogbench`` package that steers this arm.
+        model: the ``mujoco.MjModel``, shared by all arms of the process: do not write to it.
+        ogbench: the environment of the ``ogbench`` package that controls this arm.
 
     Raises:
         ImportError: MuJoCo or ogbench is not installed.
@@ -88,14 +87,14 @@ class CubeArm:
         template = compiled()
         self.model: mujoco.MjModel = template.model
         self._data = self._mujoco.MjData(self.model)
-        self._probe = self._mujoco.MjData(self.model)  # for questions, which leave the simulation alone
+        self._probe = self._mujoco.MjData(self.model)  # for :meth:`measure`, which does not change the simulation
         # A shallow copy shares the models and constants; what a step writes to is replaced.
         self.ogbench = copy.copy(template)
         self.ogbench._data = self._data
         self.ogbench._ik = type(template._ik)(model=template._ik._model, sites=["attachment_site"])
 
     def __getstate__(self) -> np.ndarray:
-        return self.state  # which decides, with the action, about every further step
+        return self.state  # together with the action it determines every further step
 
     def __setstate__(self, state: np.ndarray) -> None:
         self.__init__()
@@ -107,20 +106,20 @@ class CubeArm:
         return np.concatenate([self._data.qpos, self._data.qvel])
 
     def restore(self, state: np.ndarray) -> None:
-        """Puts the simulator into ``state`` [41]; no physics is run.
+        """Restores a state without a physics step.
 
         Args:
-            state: [41] float64.
+            state (np.ndarray): [41] float64.
         """
-        self._mujoco.mj_resetData(self.model, self._data)  # also ends the "bad state" of a simulation that blew up
+        self._mujoco.mj_resetData(self.model, self._data)  # also clears the "bad state" of a simulation that diverged
         self._data.qpos[:] = state[:NUM_POSITIONS]
         self._data.qvel[:] = state[NUM_POSITIONS:]
 
     def step(self, action: np.ndarray) -> None:
-        """Holds one action for 0.05 s, 25 substeps.
+        """Applies one action for 0.05 s, 25 substeps.
 
         Args:
-            action: [5] float64.
+            action (np.ndarray): [5] float64.
         """
         positions = self._data.qpos.copy()
         self._late_kinematics(self._data, positions, self._data.qvel)
@@ -130,12 +129,12 @@ class CubeArm:
         self._mujoco.mj_step(self.model, self._data, nstep=self.ogbench._n_steps)
 
     def resting(self, *, arm_yaw: float, cube_position: np.ndarray, cube_yaw: float) -> np.ndarray:
-        """Makes a state in which nothing moves: the open gripper at its start position, the cube on the floor.
+        """Builds a state at rest: the open gripper at its start position, the cube on the floor.
 
         Args:
-            arm_yaw: of the gripper, rad.
-            cube_position: [2], x and y of the centre, m.
-            cube_yaw: rad.
+            arm_yaw (float): yaw of the gripper, in rad.
+            cube_position (np.ndarray): [2], x and y of the centre, in m.
+            cube_yaw (float): yaw of the cube, in rad.
 
         Returns:
             [41] float64.
@@ -157,14 +156,14 @@ class CubeArm:
         return state
 
     def measure(self, state: np.ndarray) -> dict[str, np.ndarray]:
-        """Reads what OGBench's experts look at off a state, under OGBench's names.
+        """Computes the observations of OGBench's experts at a state, under OGBench's names.
 
         Args:
-            state: [41] float64.
+            state (np.ndarray): [41] float64.
 
         Returns:
-            ``proprio/effector_pos`` [3] in m and ``proprio/effector_yaw`` [1] in rad, as late as the controller sees
-            them; ``proprio/gripper_opening`` [1] from 0, open, to 1; ``privileged/block_0_pos`` [3] in m and
+            ``proprio/effector_pos`` [3] in m and ``proprio/effector_yaw`` [1] in rad, one substep late as in the
+            controller; ``proprio/gripper_opening`` [1] from 0, open, to 1; ``privileged/block_0_pos`` [3] in m and
             ``privileged/block_0_yaw`` [1] in rad.
         """
         from ogbench.manipspace import lie
@@ -183,17 +182,17 @@ class CubeArm:
         }
 
     def _late_kinematics(self, data: mujoco.MjData, positions: np.ndarray, velocities: np.ndarray) -> None:
-        """Computes the body poses of one substep ago, those that MuJoCo still holds after a published step."""
+        """Computes the body poses one substep earlier, which MuJoCo still holds after a published step."""
         data.qpos[:] = positions
         self._mujoco.mj_integratePos(self.model, data.qpos, velocities, -self.model.opt.timestep)
         self._mujoco.mj_kinematics(self.model, data)
 
 
 def yaw_rotation(yaw: float) -> np.ndarray:
-    """Writes a turn about the vertical axis as a quaternion.
+    """The quaternion of a rotation about the vertical axis.
 
     Args:
-        yaw: rad.
+        yaw (float): in rad.
 
     Returns:
         [4] float64, w, x, y, z.

@@ -1,4 +1,4 @@
-"""PushT: a disc that pushes a T-shaped block to a given place and angle."""
+"""The environment PushT: a disc pushes a T-shaped block to a given position and angle."""
 
 from __future__ import annotations
 
@@ -8,38 +8,41 @@ from typing import Any, get_args
 import numpy as np
 from gymnasium import spaces
 
-from torchrl_ficreg.envs.base import GOAL_STATE, GoalEnv
+from torchrl_ficreg.envs.base import PixelGoalEnv
 from torchrl_ficreg.envs.push_t import tasks
-from torchrl_ficreg.envs.push_t.physics import PushTWorld, STATE_SIZE
-from torchrl_ficreg.envs.push_t.render import render
+from torchrl_ficreg.envs.push_t.geometry import STATE_SIZE
+from torchrl_ficreg.envs.push_t.physics import PushTWorld
+from torchrl_ficreg.envs.push_t.render import render_pixels
 from torchrl_ficreg.envs.push_t.tasks import SuccessRule
-from torchrl_ficreg.keys import STATE
+from torchrl_ficreg.keys import GOAL_STATE, STATE
 
-# The disc passes walls: 200 steps of full speed, 40.7 px each, from the inside of the window stay within this.
+# The disc passes through walls: 200 steps of full speed, 40.7 px each, from inside the window stay within this.
 _FARTHEST = 10_000.0  # px, and px/s
 # A recording in float32 may round an angle just below 2 pi up to this.
 _LARGEST_ANGLE = float(np.float32(2 * math.pi))
 
 
-class PushTEnv(GoalEnv):
+class PushTEnv(PixelGoalEnv):
     """The block-pushing task as a Gymnasium environment.
 
     State [7]: x and y of the agent, x, y and angle (in [0, 2 pi)) of the block, velocity x and y of the agent, in
     pixels of a 512 x 512 window, radians and px/s. Action [2]: shift of the agent's target in x and y, 100 px per
-    unit; actions beyond [-1, 1] are obeyed, as in the published environment. A step lasts 0.1 s. Success: agent and
-    block within 20 px of the goal, one distance in four dimensions, and the angle within 20 degrees. Starts and goals
-    come from the same draws, at rest and clear of overlaps.
+    unit; actions beyond [-1, 1] are not clipped, as in the published environment. A step lasts 0.1 s. Success: agent
+    and block within 20 px of the goal, one distance in four dimensions, and the angle within 20 degrees. Starts and
+    goals come from the same distribution, at rest and without overlaps.
 
-    The green T in the pictures is decoration at a fixed place: the goal of an episode is ``goal_state``.
+    The green T in the pictures is a decoration at a fixed place: the goal of an episode is ``goal_state``.
 
     Args:
-        success_on: ``"state"`` or, to leave the agent out, ``"block"``; see
-            :func:`torchrl_ficreg.envs.push_t.tasks.is_success`.
-        draw_goal: draw the green T.
-        legacy_restore: reset as the published environment does, which puts the scene at the goal and then at the
-            start with a physics step of 0.01 s after each: the episode begins near the start instead of at it.
-        legacy_draws: starts and goals may overlap walls and each other, as in the published environment.
-        **kwargs: see :class:`torchrl_ficreg.envs.base.GoalEnv`.
+        success_on (str, optional): ``"state"``, or ``"block"`` to leave the agent out; see
+            :func:`torchrl_ficreg.envs.push_t.tasks.is_success`. Default: ``"state"``.
+        draw_goal (bool, optional): draw the green T. Default: ``True``.
+        legacy_restore (bool, optional): reset as the published environment does, which sets the scene to the goal and
+            then to the start with a physics step of 0.01 s after each: the episode begins near the start instead of
+            at it. Default: ``False``.
+        legacy_draws (bool, optional): starts and goals may contain overlaps, as in the published environment. Default:
+            ``False``.
+        **kwargs: see :class:`torchrl_ficreg.envs.base.PixelGoalEnv`.
 
     Raises:
         ValueError: an argument out of range.
@@ -82,13 +85,13 @@ class PushTEnv(GoalEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Starts an episode, see :meth:`torchrl_ficreg.envs.base.GoalEnv.reset`."""
+        """Starts an episode, see :meth:`torchrl_ficreg.envs.base.PixelGoalEnv.reset`."""
         observation, info = super().reset(seed=seed, options=options)
         if not self.legacy_restore:
             return observation, info
         start, goal = observation[STATE], observation[GOAL_STATE]
         self._world.set_state(goal)
-        self._world.restore_legacy(goal)  # the published reset visits the goal to draw it, and that leaves traces
+        self._world.restore_legacy(goal)  # the published reset simulates a step at the goal, which affects the start
         self._world.restore_legacy(start)
         return self._observe(), self._info(self._is_success(self._get_state(), goal))
 
@@ -108,7 +111,7 @@ class PushTEnv(GoalEnv):
         self._world.step(action)
 
     def _draw(self, state: np.ndarray) -> np.ndarray:
-        return render(state, size=self.image_size, draw_goal=self.draw_goal)
+        return render_pixels(state, size=self.image_size, draw_goal=self.draw_goal)
 
     def _is_success(self, state: np.ndarray, goal_state: np.ndarray) -> bool:
         return tasks.is_success(state, goal_state, success_on=self.success_on)

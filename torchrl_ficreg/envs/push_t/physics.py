@@ -1,96 +1,54 @@
-"""The world of PushT: a driven disc and a T that rests unless it is touched, in pymunk.
+"""Physics of PushT: a driven disc and a T that rests unless it is touched, simulated by pymunk.
 
-See :mod:`torchrl_ficreg.envs.push_t.physics` for lengths and axes. Times are in seconds.
+Lengths and the state's layout are those of :mod:`torchrl_ficreg.envs.push_t.geometry`; times are in seconds.
 """
 
 from __future__ import annotations
 
-import math
 import weakref
 from typing import Any
 
 import numpy as np
 
-
-WINDOW = 512
-AGENT_RADIUS = 15.0
-WALL_LOW, WALL_HIGH, WALL_RADIUS = 5.0, 506.0, 2.0
-BAR = ((-60.0, 30.0), (60.0, 30.0), (60.0, 0.0), (-60.0, 0.0))
-STEM = ((-15.0, 30.0), (-15.0, 120.0), (15.0, 120.0), (15.0, 30.0))
-CENTER_OF_GRAVITY = (0.0, 45.0)
-GOAL_POSE = (256.0, 256.0, math.pi / 4)  # of the green T, which is decoration: goals are drawn for each episode
-
-T_CORNERS = np.array(BAR + STEM)  # [8, 2], in the frame of the block
-STATE_SIZE = 7  # agent x, y; block x, y, angle in [0, 2 pi); agent velocity x, y in px/s
-
-
-def wrap(angle: float) -> float:
-    """Brings an angle to [0, 2 pi); one that is there already keeps its bits.
-
-    Examples:
-        >>> wrap(-1e-20), wrap(7.0) == 7.0 - 2 * math.pi
-        (0.0, True)
-    """
-    wrapped = angle % (2 * math.pi)
-    return wrapped if wrapped < 2 * math.pi else 0.0  # a tiny negative angle is rounded up to the whole turn
-
-
-def part_distances(x: np.ndarray, y: np.ndarray, *, stem_top: float = 30.0) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distances of points, in the frame of the block, from the edges of its bar and of its stem.
-
-    Args:
-        x: [...] float.
-        y: [...] float.
-        stem_top: where the stem begins; 0 lets it reach through the bar, so that the two have no seam.
-
-    Returns:
-        two arrays [...], negative inside.
-
-    Examples:
-        >>> part_distances(np.array([0.0, 0.0]), np.array([10.0, 130.0]))
-        (array([-10., 100.]), array([20., 10.]))
-    """
-    x = np.abs(x)
-    return _rectangle(x, y, 60.0, 0.0, 30.0), _rectangle(x, y, 15.0, stem_top, 120.0)
-
-
-def _rectangle(x: np.ndarray, y: np.ndarray, right: float, top: float, bottom: float) -> np.ndarray:
-    beside = x - right
-    beyond = np.abs(y - (top + bottom) / 2) - (bottom - top) / 2
-    nearest = np.maximum(beside, beyond)  # exact inside, and outside where one of the two is negative
-    corner = np.hypot(np.maximum(beside, 0), np.maximum(beyond, 0))
-    return np.where(nearest > 0, corner, nearest)
-
+from torchrl_ficreg.envs._angles import wrap_angle
+from torchrl_ficreg.envs.push_t.geometry import (
+    AGENT_RADIUS,
+    BAR,
+    CENTER_OF_GRAVITY,
+    STATE_SIZE,
+    STEM,
+    WALL_HIGH,
+    WALL_LOW,
+    WALL_RADIUS,
+)
 
 try:
     import pymunk
 except ImportError as error:
     raise ImportError("PushT needs pymunk: pip install 'torchrl_ficreg[envs]'.") from error
 
-
 BLOCK_MASS, BLOCK_MOMENT = 1.0, 3000.0
-
 ACTION_SCALE = 100.0  # px of target shift per unit of action
 STIFFNESS, DAMPING = 100.0, 20.0  # of the PD law that drives the disc, 1/s^2 and 1/s
 TIME_STEP, SUBSTEPS = 0.01, 10  # s, and how many of them make an environment step
-
-MOST_CALLS = 10_000  # that a copy repeats, 2 s; without a restoration there could be any number of them
+MOST_CALLS = 10_000  # that a copy repeats, 2 s
 
 
 class PushTWorld:
     """A restorable simulation: the same state and actions give the same bits, whatever happened before.
 
-    A copy or an unpickled world repeats what was done since the last :meth:`set_state`, so that it also has the contacts
-    that the solver remembers and goes on with the same bits. After 10,000 calls without one it cannot be copied.
+    A copied or unpickled world repeats the calls since the last :meth:`set_state`, so that its solver holds the same
+    cached contacts and its next steps have the same bits. After 10,000 calls without a :meth:`set_state`, copying raises
+    ``RuntimeError``.
 
-    The disc is kinematic: it pushes the block, nothing pushes it, and walls do not stop it. Space has no friction and
-    a damping that stills the block between two contacts.
+    The disc is kinematic: it pushes the block, and neither the block nor the walls act on it. There is no friction, and
+    the damping stops the block as soon as it is not touched.
 
-    State: [7] float64, see :mod:`torchrl_ficreg.envs.push_t.physics`.
+    The state, [7] float64, is laid out in :mod:`torchrl_ficreg.envs.push_t.geometry`.
 
     Args:
-        relative: an action shifts the target from where the disc is, by 100 px per unit; otherwise it is the target
-            itself, in pixels.
+        relative (bool, optional): whether an action shifts the disc's target from its present position, by 100 px per
+            unit; otherwise the action is the target itself, in pixels. Default: ``True``.
 
     Examples:
         >>> world = PushTWorld()
@@ -105,8 +63,8 @@ class PushTWorld:
         self._state = np.zeros(STATE_SIZE)
         self._journal: list[tuple[str, np.ndarray]] = []  # calls since the space was built, with their argument
         self._build()
-        # pymunk frees a space by Python code, which fails loudly in an interpreter that is being torn down: a world
-        # still alive at exit lets go of its space before that.
+        # pymunk frees a space by Python code, which prints an exception when the interpreter is being finalized: a
+        # world still alive at exit drops its space earlier.
         weakref.finalize(self, vars(self).clear)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -155,7 +113,7 @@ class PushTWorld:
     def restore_legacy(self, state: np.ndarray) -> None:
         """Restores a state [7] as the published environment does: in the running space, with one physics step.
 
-        The agent is carried on by its velocity, and what overlapped before the restoration pushes the block after it.
+        The agent moves by one step of its velocity, and an overlap from before the restoration still pushes the block.
         """
         self._note("restore_legacy", state)
         self._place(state)
@@ -170,14 +128,14 @@ class PushTWorld:
         self.block.position = (block_x, block_y)
 
     def get_state(self) -> np.ndarray:
-        """The state [7], a copy."""
+        """Returns a copy of the state, [7] float64."""
         return self._state.copy()
 
     def step(self, action: np.ndarray) -> None:
         """Drives the disc for 0.1 s.
 
         Args:
-            action: [2] float64, not clipped.
+            action (np.ndarray): [2] float64, not clipped.
         """
         action = np.asarray(action, dtype=np.float64)
         self._note("step", action)
@@ -197,7 +155,7 @@ class PushTWorld:
             [
                 *self.agent.position,
                 *self.block.position,
-                wrap(self.block.angle),
+                wrap_angle(self.block.angle, low=0.0),
                 *self.agent.velocity,
             ]
         )

@@ -1,11 +1,11 @@
-"""Pictures of PushT: the T and the disc on white, the walls around them, and a green T that means nothing.
+"""Pictures of PushT: the T and the disc on white, the walls, and a decorative green T at a fixed place.
 
-Colours, outline and order are those of the published picture: the green T at its fixed place, the bar and the stem of
-the block, the disc, the walls. The scene is sampled on a grid at most two window pixels fine by signed distances, each
-sample being a blend of the two sides of an edge, and then area-averaged: a picture shows what a larger one would, seen
-from farther away. At 224 px the mean absolute difference from the published picture is 0.4 of 255 grey levels; a block
-moved by one pixel of the window makes 0.17. The red specks of the published picture where the disc touches the block
-are left out: two pixels, 0.005.
+Colours, outlines and order of drawing are those of the published picture: the green T, the bar and the stem of the
+block, the disc, the walls. The scene is sampled by signed distances on a grid with a spacing of at most two pixels of
+the window, with edges blended over one sample, and then area-averaged: a small picture is the average of a large one.
+At 224 px the mean absolute difference from the published picture is 0.4 of 255 grey levels; moving the block by one
+pixel of the window changes 0.17. The red marks of the published picture where the disc touches the block are left out:
+two pixels, 0.005.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_ficreg.envs.push_t.physics import (
+from torchrl_ficreg.envs.push_t.geometry import (
     AGENT_RADIUS,
-    GOAL_POSE,
+    corners,
+    DECORATION_POSE,
     part_distances,
     STATE_SIZE,
-    T_CORNERS,
     WALL_HIGH,
     WALL_LOW,
     WALL_RADIUS,
@@ -36,21 +36,22 @@ WALL_COLOR = (211.0, 211.0, 211.0)
 
 OUTLINE_RADIUS = 2.0  # of the round pen along the edges of the block, px of the window
 INNER_RADIUS = 11.0  # of the disc within its rim
-# pygame fills every pixel that an edge passes through, which widens pens and unoutlined polygons by half a pixel at
-# each side, and gives discs an even diameter, whose middle lies half a pixel up and left.
+# pygame fills every pixel that an edge crosses, which widens pens and polygons without outline by half a pixel at each
+# side, and gives discs an even diameter, whose middle lies half a pixel up and left.
 _GROWTH = 0.5
 _DISC_SHIFT = -0.5
 _PEN = OUTLINE_RADIUS + _GROWTH
 _COARSEST_SAMPLE = 2.0  # px of the window: the width of the outline's pen
 
 
-def render(states: np.ndarray, *, size: int = 224, draw_goal: bool = True) -> np.ndarray:
+def render_pixels(states: np.ndarray, *, size: int = 224, draw_goal: bool = True) -> np.ndarray:
     """Draws scenes.
 
     Args:
-        states: [..., 7] float, see :mod:`torchrl_ficreg.envs.push_t.physics`; only the first five numbers are seen.
-        size: height and width of the pictures, in pixels.
-        draw_goal: draw the decorative green T of the published picture, which marks no goal.
+        states (np.ndarray): [..., 7], see :mod:`torchrl_ficreg.envs.push_t.geometry`; the velocities are not drawn.
+        size (int, optional): height and width of the pictures, in pixels. Default: ``224``.
+        draw_goal (bool, optional): draw the green T of the published picture, a decoration that marks no goal. Default:
+            ``True``.
 
     Returns:
         [..., 3, size, size] uint8, red, green, blue; a new array.
@@ -59,7 +60,7 @@ def render(states: np.ndarray, *, size: int = 224, draw_goal: bool = True) -> np
         ValueError: ``size`` is not a positive integer, the shape is wrong, or a number is not finite.
 
     Examples:
-        >>> picture = render(np.array([100.0, 100.0, 300.0, 300.0, 0.0, 0.0, 0.0]), size=64)
+        >>> picture = render_pixels(np.array([100.0, 100.0, 300.0, 300.0, 0.0, 0.0, 0.0]), size=64)
         >>> picture.shape, picture[:, 12, 12].tolist(), picture[:, 39, 37].tolist()
         ((3, 64, 64), [78, 126, 255], [143, 163, 184])
     """
@@ -67,7 +68,7 @@ def render(states: np.ndarray, *, size: int = 224, draw_goal: bool = True) -> np
     if states.shape[-1:] != (STATE_SIZE,):
         raise ValueError(f"states must be [..., {STATE_SIZE}], got {states.shape}: pass whole states.")
     if not np.isfinite(states[..., :5]).all():
-        raise ValueError("states must be finite: look for a NaN in the places or the angle.")
+        raise ValueError("states must be finite: look for a NaN in the positions or the angle.")
     canvas = _canvas(size, draw_goal)
     rows = states.reshape(-1, STATE_SIZE)  # [N, 7]
     pictures = np.empty((len(rows), 3, size, size), dtype=np.uint8)
@@ -82,7 +83,7 @@ def _canvas(size: int, draw_goal: bool) -> _Canvas:
 
 
 class _Canvas:
-    """What all pictures of one size share: the sampling grid and the scene without block and disc.
+    """Draws pictures of one size; holds the sampling grid and the scene without block and disc.
 
     Only the boxes around the block and the disc are sampled for a picture; the rest is copied.
     """
@@ -98,7 +99,7 @@ class _Canvas:
         full = (slice(0, size), slice(0, size))
         self.floor = np.broadcast_to(_column(WHITE), (3, len(self.grid), len(self.grid))).copy()  # [3, S, S]
         if draw_goal:
-            parts = part_distances(*self._block_frame(GOAL_POSE, *full), stem_top=0.0)
+            parts = part_distances(*self._block_frame(DECORATION_POSE, *full), stem_top=0.0)
             _paint(self.floor, self._cover(np.minimum(*parts) - _GROWTH), GOAL_COLOR)
         centers = (WALL_LOW + WALL_HIGH) / 2
         from_center = np.abs(self.grid - centers)
@@ -111,11 +112,9 @@ class _Canvas:
         x, y, *pose = state[:5].tolist()
         x, y = x + _DISC_SHIFT, y + _DISC_SHIFT
         picture[:] = self.empty
-        cosine, sine = math.cos(pose[2]), math.sin(pose[2])
-        corners = T_CORNERS @ np.array([[cosine, sine], [-sine, cosine]]) + pose[:2]  # [8, 2]
-        left, top = corners.min(0) - _PEN
-        right, bottom = corners.max(0) + _PEN
-        block = self._pixels(top, bottom), self._pixels(left, right)
+        across, along = corners(state[2:5])  # [8] each
+        rows = self._pixels(along.min() - _PEN, along.max() + _PEN)
+        block = rows, self._pixels(across.min() - _PEN, across.max() + _PEN)
         self._paint_box(picture, block, pose, None)
         disc = self._pixels(y - AGENT_RADIUS, y + AGENT_RADIUS), self._pixels(x - AGENT_RADIUS, x + AGENT_RADIUS)
         apart = any(a.start >= b.stop or b.start >= a.stop for a, b in zip(block, disc, strict=True))
@@ -149,21 +148,21 @@ class _Canvas:
         picture[(slice(None), *box)] = self._average(colors, rows, columns)
 
     def _pixels(self, low: float, high: float) -> slice:
-        """The pixels of an axis that a stretch of the window touches, those a blended edge reaches included."""
+        """The pixels that an interval of the window covers along one axis, one sample of blending included."""
         pixel = self.spacing * self.fold
         start = math.floor((low + 0.5 - self.spacing) / pixel)
         stop = math.ceil((high + 0.5 + self.spacing) / pixel)
         return slice(max(start, 0), min(stop, self.size))
 
     def _block_frame(self, pose: Sequence[float], rows: slice, columns: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Where the samples of a box lie as seen from a block: two arrays [h, w] float32."""
+        """Coordinates of the samples of a box in the frame of a block: two arrays [h, w] float32."""
         x = self.grid[columns.start * self.fold : columns.stop * self.fold] - np.float32(pose[0])
         y = self.grid[rows.start * self.fold : rows.stop * self.fold, None] - np.float32(pose[1])
         cosine, sine = np.float32(math.cos(pose[2])), np.float32(math.sin(pose[2]))
         return cosine * x + sine * y, cosine * y - sine * x
 
     def _cover(self, distance: np.ndarray) -> np.ndarray:
-        """How much of a sample's cell lies where a signed distance is negative."""
+        """Share of each sample's cell in which a signed distance is negative, in [0, 1]."""
         return np.clip(np.float32(0.5) - distance / np.float32(self.spacing), 0, 1)
 
     def _average(self, colors: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
@@ -179,6 +178,6 @@ def _column(color: tuple[float, float, float]) -> np.ndarray:
 
 
 def _paint(colors: np.ndarray, cover: np.ndarray, color: tuple[float, float, float]) -> np.ndarray:
-    """Lays a colour over [3, h, w] samples in place, where and as much as ``cover`` [h, w] says."""
+    """Blends a colour into [3, h, w] samples in place, with opacity ``cover`` [h, w]."""
     colors += cover * (_column(color) - colors)
     return colors

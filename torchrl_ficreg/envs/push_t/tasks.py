@@ -1,4 +1,4 @@
-"""Which starts and goals an episode of PushT is made of, and when a goal is reached."""
+"""Tasks of PushT: the draws of starts and goals, and the success rule."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from torchrl_ficreg.envs.push_t.physics import (
+from torchrl_ficreg.envs._angles import wrap_angle
+from torchrl_ficreg.envs.push_t.geometry import (
     AGENT_RADIUS,
+    corners,
     part_distances,
     STATE_SIZE,
-    T_CORNERS,
+    to_block,
     WALL_HIGH,
     WALL_LOW,
     WALL_RADIUS,
@@ -26,17 +28,17 @@ ANGLE_TOLERANCE = math.pi / 9
 
 
 def sample_state(rng: np.random.Generator, *, legacy_draws: bool = False) -> np.ndarray:
-    """Draws a scene at rest: agent uniform over [50, 450]^2, block over [100, 400]^2 and all angles.
+    """Draws a start or a goal, at rest: agent uniform over [50, 450]^2, block over [100, 400]^2 and all angles.
 
-    Scenes in which two bodies overlap, 14 % of the draws, are drawn again: they could not have been reached by
-    pushing, and the first steps would throw the block out of them.
+    Scenes in which two bodies overlap, 14 % of the draws, are drawn again: no push leads to them, and the first steps
+    would separate the bodies.
 
     Args:
-        rng: the source of randomness.
-        legacy_draws: keep the overlaps, as the published environment does.
+        rng (np.random.Generator): source of randomness.
+        legacy_draws (bool, optional): keep overlaps, as the published environment does. Default: ``False``.
 
     Returns:
-        [7] float64, see :mod:`torchrl_ficreg.envs.push_t.physics`.
+        [7] float64, see :mod:`torchrl_ficreg.envs.push_t.geometry`.
 
     Examples:
         >>> state = sample_state(np.random.default_rng(0))
@@ -53,39 +55,29 @@ def sample_state(rng: np.random.Generator, *, legacy_draws: bool = False) -> np.
 
 
 def is_free(state: np.ndarray) -> bool:
-    """Tells whether the agent, the block and the walls of a scene [7] are clear of each other."""
-    x, y, block_x, block_y, angle = state[:5].tolist()
-    cosine, sine = math.cos(angle), math.sin(angle)
-    corners = T_CORNERS @ np.array([[cosine, sine], [-sine, cosine]]) + (block_x, block_y)  # [8, 2]
-    if corners.min() < WALL_LOW + WALL_RADIUS or corners.max() > WALL_HIGH - WALL_RADIUS:
+    """Whether the agent, the block and the walls of a scene [7] do not overlap."""
+    pose = state[2:5]
+    x, y = corners(pose)  # [8] each
+    if min(x.min(), y.min()) < WALL_LOW + WALL_RADIUS or max(x.max(), y.max()) > WALL_HIGH - WALL_RADIUS:
         return False
-    across, along = x - block_x, y - block_y
-    bar, stem = part_distances(np.array(cosine * across + sine * along), np.array(cosine * along - sine * across))
+    bar, stem = part_distances(*to_block(pose, state[:2]))
     return bool(min(bar, stem) >= AGENT_RADIUS)
 
 
-def angle_between(first: float, second: float) -> float:
-    """The smaller angle between two directions, in [0, pi] rad.
-
-    Examples:
-        >>> round(angle_between(0.1, 6.2), 3)
-        0.183
-    """
-    return abs((first - second + math.pi) % (2 * math.pi) - math.pi)
-
-
 def is_success(state: np.ndarray, goal_state: np.ndarray, *, success_on: SuccessRule = "state") -> bool:
-    """Tells whether a goal is reached: places within 20 px and the angle of the block within 20 degrees.
+    """Whether a goal is reached: position within 20 px and angle of the block within 20 degrees.
 
     Args:
-        state: [7] float.
-        goal_state: [7] float.
-        success_on: ``"state"`` takes one distance in four dimensions, x and y of agent and block, so that the agent
-            must arrive too, as the published rule does; ``"block"`` asks only for x and y of the block.
+        state (np.ndarray): [7].
+        goal_state (np.ndarray): [7].
+        success_on (str, optional): ``"state"``, the published rule, takes one distance in four dimensions, x and y of
+            agent and block, so that the agent must arrive too; ``"block"`` takes x and y of the block alone. Default:
+            ``"state"``.
 
     Returns:
-        whether both are below their tolerances.
+        whether distance and angle are below their tolerances.
     """
     first = 0 if success_on == "state" else 2
     distance = math.dist(state[first:4], goal_state[first:4])
-    return distance < POSITION_TOLERANCE and angle_between(float(state[4]), float(goal_state[4])) < ANGLE_TOLERANCE
+    angle = abs(wrap_angle(float(state[4]) - float(goal_state[4])))
+    return distance < POSITION_TOLERANCE and angle < ANGLE_TOLERANCE

@@ -1,4 +1,10 @@
-"""Reacher: a planar two-joint arm; its model, environment and expert, each in its own file."""
+"""Reacher: turn the two joints of a planar arm to the angles of a goal.
+
+* ``env.py``: :class:`ReacherEnv`, which also draws the pictures: MuJoCo renders dm_control's own scene
+* ``tasks.py``: starts, goals and the success rule
+* ``physics.py``: the MuJoCo model
+* ``expert.py``: the policies that record data
+"""
 
 from __future__ import annotations
 

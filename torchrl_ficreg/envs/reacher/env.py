@@ -1,4 +1,4 @@
-"""dm_control's reacher as a goal-conditioned Gymnasium environment, its goals being joint angles."""
+"""The environment Reacher: dm_control's arm turns its two joints to given angles."""
 
 from __future__ import annotations
 
@@ -8,33 +8,34 @@ import numpy as np
 from gymnasium import spaces
 
 from torchrl_ficreg.envs._gl import import_mujoco, MujocoHolder, OffscreenRenderer
-from torchrl_ficreg.envs.base import GoalEnv
-from torchrl_ficreg.envs.reacher import physics
+from torchrl_ficreg.envs.base import PixelGoalEnv
+from torchrl_ficreg.envs.reacher import physics, tasks
 
 _LARGEST = 1e4  # of all angles and velocities, far beyond what the motors can do
 
 
-class ReacherEnv(MujocoHolder, GoalEnv):
+class ReacherEnv(MujocoHolder, PixelGoalEnv):
     """Turn the two joints of a planar arm by their motors until both angles are those of the goal.
 
     State: shoulder and wrist in rad, then their velocities in rad/s, [4] float64; the shoulder winds without limit.
-    Action: the motors' shares of their torque of 0.05 N m, [2], obeyed up to +-1; it lasts two control steps of
-    0.02 s. An episode starts at rest, the shoulder uniform over the circle and the wrist within +-160 degrees, and so
-    does its goal. Success: each angle within 0.05 rad of its goal, whatever the velocities. Pictures: seen from
-    above, without dm_control's target, and without the velocities.
+    Action: the torques of the two motors in units of 0.05 N m, [2], clipped to +-1; it lasts two control steps of
+    0.02 s. Starts and goals are at rest, the shoulder uniform over the circle and the wrist within +-160 degrees.
+    Success: each angle within 0.05 rad of its goal, at any velocity. Pictures: from above, without dm_control's target;
+    they depend on the angles alone.
 
     Success is tested after each control step, and the action that first reaches the goal of an episode ends there,
-    half done if need be, as in the published environment: the state then is the one that reached the goal. There is
-    no end of the episode by time, however many steps are taken.
+    after one control step if necessary, as in the published environment: the state is then the one that reached the
+    goal. Episodes have no time limit here.
 
     Args:
-        wrap: compare the shoulder's angle modulo 2 pi, because a picture does not show turns. False is the published
-            rule, by which an arm that looks right may be wrong.
-        stop_within_action: False to test success after whole actions only and to leave none half done, as recordings
-            want it.
-        shadow_size: resolution of the shadow map. 512 instead of dm_control's 2048 makes software rendering about
-            twice as fast and changes about 1 in 1000 values of a picture.
-        **kwargs: of :class:`~torchrl_ficreg.envs.base.GoalEnv`.
+        wrap (bool, optional): compare the shoulder's angle modulo 2 pi, because a picture does not show full turns.
+            False is the published rule, under which an arm may look as in the goal picture without success. Default:
+            ``True``.
+        stop_within_action (bool, optional): end the action that first reaches the goal as soon as it does. False, for
+            recordings, tests success after whole actions only. Default: ``True``.
+        shadow_size (int, optional): resolution of the shadow map. 512 instead of dm_control's 2048 makes software
+            rendering about twice as fast and changes about 1 in 1000 values of a picture. Default: ``2048``.
+        **kwargs: of :class:`~torchrl_ficreg.envs.base.PixelGoalEnv`.
 
     Raises:
         ValueError: an argument out of range.
@@ -63,25 +64,25 @@ class ReacherEnv(MujocoHolder, GoalEnv):
         self._model = physics.load_model()
         self._model.vis.quality.shadowsize = shadow_size
         self._data = self._mujoco.MjData(self._model)
-        self._drawn = self._mujoco.MjData(self._model)  # the scene in the picture: drawing leaves the arm alone
+        self._drawn = self._mujoco.MjData(self._model)  # for pictures, so that drawing does not change the simulation
         self._renderer = OffscreenRenderer(self._model, self.image_size)
         self._reached = False  # in this episode; the start does not count
 
     def close(self) -> None:
-        """Gives the renderer's resources back; drawing again takes new ones."""
+        """Releases the renderer's GL context; drawing again opens a new one."""
         self._renderer.close()
 
     def _sample_state(self, rng: np.random.Generator) -> np.ndarray:
-        return physics.sample_state(rng)
+        return tasks.sample_state(rng)
 
     def _sample_goal(self, rng: np.random.Generator, state: np.ndarray) -> np.ndarray:
-        return physics.sample_state(rng)
+        return tasks.sample_state(rng)
 
     def _get_state(self) -> np.ndarray:
         return np.concatenate([self._data.qpos, self._data.qvel])
 
     def _set_state(self, state: np.ndarray) -> None:
-        self._mujoco.mj_resetData(self._model, self._data)  # time, motors and what the solver remembers
+        self._mujoco.mj_resetData(self._model, self._data)  # time, motors and solver state
         self._data.qpos[:] = state[:2]
         self._data.qvel[:] = state[2:]
         self._reached = False
@@ -100,12 +101,12 @@ class ReacherEnv(MujocoHolder, GoalEnv):
         return self._renderer.draw(self._drawn, physics.CAMERA)
 
     def _is_success(self, state: np.ndarray, goal_state: np.ndarray) -> bool:
-        return bool(physics.is_success(state, goal_state, wrap=self.wrap))
+        return bool(tasks.is_success(state, goal_state, wrap=self.wrap))
 
     def _why_illegal(self, state: np.ndarray) -> str | None:
         limit = physics.WRIST_LIMIT + physics.WRIST_SLACK
         if np.abs(state).max() > _LARGEST:
-            return f"a number is beyond {_LARGEST:.0f}, where MuJoCo would start anew"
+            return f"a number is beyond {_LARGEST:.0f}, where MuJoCo would reset the simulation"
         if abs(state[1]) <= limit:
             return None
         return f"the wrist's stop at +-{physics.WRIST_LIMIT:.4f} rad never yields beyond +-{limit:.4f} rad"

@@ -1,4 +1,4 @@
-"""The policies that record the arm's data: random torques, and torques that reach joint angles."""
+"""Expert of Reacher: random torques, and computed torques that reach joint angles."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import get_args, Literal
 
 import numpy as np
 
-from torchrl_ficreg.envs.base import GoalEnv
-from torchrl_ficreg.envs.reacher import physics
+from torchrl_ficreg.envs.base import PixelGoalEnv
+from torchrl_ficreg.envs.reacher import tasks
 
 Kind = Literal["random", "reach", "goal"]
 
@@ -16,19 +16,19 @@ DAMPING = 0.01  # N m s
 # Of the arm about the shoulder with the wrist at a right angle; of the cosine term; of the hand about the wrist; kg m2.
 INERTIA = (9.758101e-4, 2.739469e-4, 1.886736e-4)
 STIFFNESS = 15.0  # 1/s, of the critically damped approach
-PATIENCE = 50  # actions after which a goal that noise keeps out of reach is given up
+PATIENCE = 50  # actions after which a target that noise keeps out of reach is replaced
 
 
 def reach_torque(state: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Computed torque: what makes the joint error e decay by e'' + 2 w e' + w^2 e = 0, were the motors strong enough.
+    """Computed torque: the joint error e decays by e'' + 2 w e' + w^2 e = 0 as long as the motors are strong enough.
 
     With M the inertia matrix, c the centrifugal and Coriolis torques and d the damping::
 
         torque = M (w^2 e - 2 w v) + c + d v
 
     Args:
-        state: [4] float, angles in rad and velocities in rad/s.
-        target: [2] or [4] float, the angles to reach; the shoulder goes the shorter way around.
+        state (np.ndarray): [4], angles in rad and velocities in rad/s.
+        target (np.ndarray): [2] or [4], the angles to reach; the shoulder takes the shorter direction.
 
     Returns:
         [2] float64, the action; beyond +-1 where the motors are too weak.
@@ -38,7 +38,7 @@ def reach_torque(state: np.ndarray, target: np.ndarray) -> np.ndarray:
         [True, True]
     """
     velocity = state[2:]
-    wanted = STIFFNESS**2 * physics.joint_error(state, target) - 2 * STIFFNESS * velocity  # rad/s2
+    wanted = STIFFNESS**2 * tasks.joint_error(state, target) - 2 * STIFFNESS * velocity  # rad/s2
     torque = inertia_matrix(state[1]) @ wanted + coriolis(state[1], velocity) + DAMPING * velocity
     return torque / MAX_TORQUE
 
@@ -47,7 +47,7 @@ def inertia_matrix(wrist: float) -> np.ndarray:
     """The arm's inertia about its joints.
 
     Args:
-        wrist: its angle in rad.
+        wrist (float): angle of the wrist in rad.
 
     Returns:
         [2, 2] float64, kg m2.
@@ -58,11 +58,11 @@ def inertia_matrix(wrist: float) -> np.ndarray:
 
 
 def coriolis(wrist: float, velocity: np.ndarray) -> np.ndarray:
-    """The torques that hold the arm on its course while it moves.
+    """Centrifugal and Coriolis torques.
 
     Args:
-        wrist: its angle in rad.
-        velocity: [2], rad/s.
+        wrist (float): angle of the wrist in rad.
+        velocity (np.ndarray): [2], rad/s.
 
     Returns:
         [2] float64, N m.
@@ -73,17 +73,20 @@ def coriolis(wrist: float, velocity: np.ndarray) -> np.ndarray:
 
 
 class ReacherExpert:
-    """Records data of the arm.
+    """Records data of the arm, by one of three policies.
 
-    ``"random"``: uniform torques; so were the published data recorded (their actions have standard deviation
-    1 / sqrt(3)). ``"reach"``: computed torque plus Gaussian noise, clipped, towards joint angles of its own drawing; a
-    new draw once they are reached or have been tried for 50 actions. ``"goal"``: the same towards the episode's goal.
+    ``"random"``: uniform torques, as in the published data, whose actions have standard deviation 1 / sqrt(3).
+    ``"reach"``: computed torque plus Gaussian noise, clipped, towards joint angles that are drawn at random, and drawn
+    anew once they are reached or after 50 actions. ``"goal"``: the same towards the episode's goal.
 
     Args:
-        rng: the source of actions, angles and noise; a fixed one by default.
-        env: not needed.
-        kind: which policy.
-        noise_std: standard deviation of the noise of the two reaching kinds, in actions.
+        rng (np.random.Generator, optional): source of actions, targets and noise. Default:
+            ``np.random.default_rng(0)``.
+        env (ReacherEnv, optional): not used; part of the :class:`~torchrl_ficreg.envs.registry.Expert` protocol.
+            Default: ``None``.
+        kind (str, optional): ``"random"``, ``"reach"`` or ``"goal"``. Default: ``"random"``.
+        noise_std (float, optional): standard deviation of the noise of the two reaching kinds, in actions. Default:
+            ``0.3``.
 
     Raises:
         ValueError: an unknown kind, or a noise that is negative or not finite.
@@ -98,7 +101,7 @@ class ReacherExpert:
         self,
         *,
         rng: np.random.Generator | None = None,
-        env: GoalEnv | None = None,
+        env: PixelGoalEnv | None = None,
         kind: Kind = "random",
         noise_std: float = 0.3,
     ) -> None:
@@ -116,8 +119,8 @@ class ReacherExpert:
         """Chooses the next action.
 
         Args:
-            state: [4] float, angles in rad and velocities in rad/s.
-            goal_state: [4] float; only ``kind="goal"`` looks at it.
+            state (np.ndarray): [4], angles in rad and velocities in rad/s.
+            goal_state (np.ndarray): [4]; only ``kind="goal"`` reads it.
 
         Returns:
             [2] float32 in [-1, 1].
@@ -129,7 +132,7 @@ class ReacherExpert:
         return np.clip(action, -1.0, 1.0).astype(np.float32)
 
     def _own_target(self, state: np.ndarray) -> np.ndarray:
-        if self._target is None or self._tried == PATIENCE or physics.is_success(state, self._target):
-            self._target, self._tried = physics.sample_state(self._rng), 0
+        if self._target is None or self._tried == PATIENCE or tasks.is_success(state, self._target):
+            self._target, self._tried = tasks.sample_state(self._rng), 0
         self._tried += 1
         return self._target

@@ -1,4 +1,4 @@
-"""TwoRoom: a disc that has to find the door to a goal in the other room."""
+"""The environment TwoRoom: a disc moves through a door to a goal in the other room."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from torchrl_ficreg.envs.base import GoalEnv
+from torchrl_ficreg.envs.base import PixelGoalEnv
 from torchrl_ficreg.envs.two_room import physics, tasks
 from torchrl_ficreg.envs.two_room.physics import Collision, TWO_ROOM, TwoRoomGeometry
-from torchrl_ficreg.envs.two_room.render import render
+from torchrl_ficreg.envs.two_room.render import render_pixels
 
 
-class TwoRoomEnv(GoalEnv):
+class TwoRoomEnv(PixelGoalEnv):
     """The two-room navigation task as a Gymnasium environment.
 
     State: x and y of the agent in pixels of the 224 x 224 canvas. Action: [2] in [-1, 1], 5 px per unit and axis;
@@ -22,10 +22,10 @@ class TwoRoomEnv(GoalEnv):
     a goal at least 25 full-speed steps away.
 
     Args:
-        collision: the wall rule, ``"swept"`` or, for the published one, ``"endpoint"``; see
-            :func:`torchrl_ficreg.envs.two_room.physics.step`.
-        geometry: the scene.
-        **kwargs: see :class:`torchrl_ficreg.envs.base.GoalEnv`.
+        collision (str, optional): the wall rule, ``"swept"``, or ``"endpoint"`` for the published one; see
+            :func:`torchrl_ficreg.envs.two_room.physics.step`. Default: ``"swept"``.
+        geometry (TwoRoomGeometry, optional): the scene. Default: ``TWO_ROOM``.
+        **kwargs: see :class:`torchrl_ficreg.envs.base.PixelGoalEnv`.
 
     Raises:
         ValueError: an argument out of range.
@@ -70,11 +70,10 @@ class TwoRoomEnv(GoalEnv):
         )
 
     def _draw(self, state: np.ndarray) -> np.ndarray:
-        return render(torch.from_numpy(state), size=self.image_size, geometry=self.geometry).numpy()
+        return render_pixels(torch.from_numpy(state), size=self.image_size, geometry=self.geometry).numpy()
 
     def _is_success(self, state: np.ndarray, goal_state: np.ndarray) -> bool:
-        reached = physics.is_success(torch.from_numpy(state), torch.from_numpy(goal_state), geometry=self.geometry)
-        return bool(reached)
+        return bool(tasks.is_success(torch.from_numpy(state), torch.from_numpy(goal_state), geometry=self.geometry))
 
     def _why_illegal(self, state: np.ndarray) -> str | None:
         if physics.is_legal(torch.from_numpy(state), geometry=self.geometry):

@@ -1,4 +1,4 @@
-"""The scripted policy that recorded the published two-room data."""
+"""Expert of TwoRoom: the scripted policy that recorded the published data."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ SWITCH_DISTANCE = 10.5  # px from the door centre at which the agent turns to th
 
 
 class TwoRoomExpert:
-    """Walks to the door, then to the goal, with Gaussian noise on every action.
+    """Moves to the door, then to the goal, with Gaussian noise on every action.
 
     Each action is the unit vector towards the current waypoint plus noise, clipped to [-1, 1]. The waypoint is the
     goal in the same room and the centre of the door otherwise, until the agent is within 10.5 px of it. From there
-    the published policy goes straight for the goal, along the jamb if need be; this one first leaves the corridor at
-    the height nearest to the goal, because a jamb leaves only the component along it.
+    the published policy moves straight to the goal, along the jamb if necessary; this one first leaves the corridor at
+    the height nearest to the goal, because a jamb admits only the component along it.
 
     Args:
-        noise_std: standard deviation of the noise per component, in actions. The published data have 2.0: 63 % of
-            the components then sit at a bound.
-        rng: the source of the noise; a fixed one by default, so that equal calls give equal episodes.
-        env: the environment whose scene it walks; the default scene without one.
+        noise_std (float, optional): standard deviation of the noise per component, in actions. With the published
+            value, 2.0, 63 % of the components are at a bound. Default: ``2.0``.
+        rng (np.random.Generator, optional): source of the noise. Default: ``np.random.default_rng(0)``.
+        env (TwoRoomEnv, optional): the environment whose geometry is used. Default: ``None``, the default geometry.
 
     Raises:
         ValueError: ``noise_std`` is negative or not finite.
@@ -54,8 +54,8 @@ class TwoRoomExpert:
         """Chooses the next action.
 
         Args:
-            state: [2] float, x and y of the agent.
-            goal_state: [2] float, x and y of the goal.
+            state (np.ndarray): [2], x and y of the agent.
+            goal_state (np.ndarray): [2], x and y of the goal.
 
         Returns:
             [2] float32 in [-1, 1].

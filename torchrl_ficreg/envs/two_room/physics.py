@@ -1,7 +1,7 @@
-"""Kinematics of the two rooms: a disc, a border, a wall with one door.
+"""Physics of TwoRoom: a disc, a border, and a wall with one door.
 
-All lengths are pixels of a 224 x 224 canvas, x to the right and y down. The agent is a point (the centre of its
-disc): its radius is already taken off every obstacle, so the wall appears to it as a slab between two faces::
+All lengths are pixels of a 224 x 224 canvas, x to the right and y down. The agent is the centre of its disc: every
+obstacle is enlarged by its radius, so that the wall is a slab between two faces::
 
       x = 21         100    112    124          203
         |  left room  |      |      |  right room |
@@ -25,7 +25,7 @@ Collision = Literal["swept", "endpoint"]
 
 @dataclass(frozen=True)
 class TwoRoomGeometry:
-    """The numbers of the scene, in pixels of the canvas; the defaults are those of the published TwoRoom task.
+    """The sizes of the scene, in pixels of the canvas; the defaults are those of the published TwoRoom task.
 
     Raises:
         ValueError: a step could jump across the wall or across the door, or the door does not fit into the wall.
@@ -45,7 +45,7 @@ class TwoRoomGeometry:
     wall_half_thickness: float = 5.0
     door_center: float = 49.0  # y of the middle of the door
     door_half_extent: float = 14.0
-    door_margin: float = 1.75  # how far past the drawn door the agent's centre may be and still pass
+    door_margin: float = 1.75  # distance past the drawn door at which the agent's centre still passes
     agent_radius: float = 7.0
     speed: float = 5.0  # distance moved along one axis by a full action
     rest_gap: float = 0.5  # distance from the face at which a stopped agent rests
@@ -55,7 +55,7 @@ class TwoRoomGeometry:
         if not 0 < self.speed < min(self.face_right - self.face_left, self.door_high - self.door_low):
             raise ValueError(
                 f"speed must be positive and below the width of the wall ({self.face_right - self.face_left}) and of "
-                f"the door ({self.door_high - self.door_low}), got {self.speed}: a step may meet one face only."
+                f"the door ({self.door_high - self.door_low}), got {self.speed}: a step may cross one face only."
             )
         if not self.low <= self.door_low < self.door_high <= self.high:
             raise ValueError(
@@ -75,22 +75,22 @@ class TwoRoomGeometry:
 
     @property
     def face_left(self) -> float:
-        """Where an agent in the left room touches the wall, an x."""
+        """x at which an agent in the left room touches the wall."""
         return self.wall_center - self.wall_half_thickness - self.agent_radius
 
     @property
     def face_right(self) -> float:
-        """Where an agent in the right room touches the wall, an x."""
+        """x at which an agent in the right room touches the wall."""
         return self.wall_center + self.wall_half_thickness + self.agent_radius
 
     @property
     def rest_left(self) -> float:
-        """Where the wall leaves an agent that it stopped in the left room, an x."""
+        """x at which an agent stopped by the wall in the left room rests."""
         return self.face_left - self.rest_gap
 
     @property
     def rest_right(self) -> float:
-        """Where the wall leaves an agent that it stopped in the right room, an x."""
+        """x at which an agent stopped by the wall in the right room rests."""
         return self.face_right + self.rest_gap
 
     @property
@@ -112,20 +112,20 @@ def step(
 ) -> Tensor:
     """Moves the agent by one action: ``position + speed * clip(action, -1, 1)``, as far as the walls allow.
 
-    * ``"swept"`` follows the straight segment of the step. Where it meets a face outside the door, x stops at the
-      rest position and y slides on. Inside the corridor y is kept between the jambs. The segment from the old to the
+    * ``"swept"`` follows the straight segment of the step. Where it crosses a face outside the door, x stops at the
+      rest position and y continues. Inside the corridor, y is clamped to the door. The segment from the old to the
       new position therefore never passes through the obstacle.
     * ``"endpoint"`` is the rule of the published environment: only y at the end of the step is compared with the
-      door. It lets an agent cut the corner of a jamb, and throws one that touches a jamb inside the corridor back to
-      the face of the half it stood in, up to 11.5 px away. Use it to reproduce published data.
+      door. An agent may cut the corner of a jamb, and one that touches a jamb inside the corridor is moved back to
+      the face of its half, up to 11.5 px away. Use it to reproduce published data.
 
-    The two agree wherever the step stays out of the slab, and for steps that enter or stay within the door's span.
+    Both agree for steps that stay out of the slab, and for steps that enter it or stay in it within the door's span.
 
     Args:
-        position: [..., 2] float, x and y; must be legal (see :func:`is_legal`), which is not checked here.
-        action: [..., 2] float, any real dtype; computed in the dtype of ``position``.
-        geometry: the scene.
-        collision: the wall rule.
+        position (Tensor): [..., 2] float, x and y; must be legal (see :func:`is_legal`), which is not checked here.
+        action (Tensor): [..., 2], any real dtype; computed in the dtype of ``position``.
+        geometry (TwoRoomGeometry, optional): the scene. Default: ``TWO_ROOM``.
+        collision (str, optional): the wall rule, ``"swept"`` or ``"endpoint"``. Default: ``"swept"``.
 
     Returns:
         [..., 2], the new position, in the dtype of ``position``.
@@ -146,14 +146,45 @@ def step(
     return resolve(position, target, geometry)
 
 
+def in_wall(position: Tensor, *, geometry: TwoRoomGeometry = TWO_ROOM) -> Tensor:
+    """Whether the agent's centre is inside the obstacle, which no step reaches.
+
+    Args:
+        position (Tensor): [..., 2] float.
+        geometry (TwoRoomGeometry, optional): the scene. Default: ``TWO_ROOM``.
+
+    Returns:
+        [...] bool; the faces and the jambs themselves are free.
+    """
+    x, y = position.unbind(-1)
+    return _in_slab(x, geometry) & ~_in_door(y, geometry)
+
+
+def is_legal(position: Tensor, *, geometry: TwoRoomGeometry = TWO_ROOM) -> Tensor:
+    """Whether an episode may start at a position: within the outer wall and not in the obstacle.
+
+    Starts of the published task lie up to one radius closer to the outer wall than any step leads
+    (:attr:`TwoRoomGeometry.low`); they are legal, and the first step moves them inwards.
+
+    Args:
+        position (Tensor): [..., 2] float.
+        geometry (TwoRoomGeometry, optional): the scene. Default: ``TWO_ROOM``.
+
+    Returns:
+        [...] bool; false for NaN.
+    """
+    inside = (position >= geometry.border) & (position <= geometry.canvas - geometry.border)
+    return inside.all(-1) & ~in_wall(position, geometry=geometry)
+
+
 def _swept(position: Tensor, target: Tensor, geometry: TwoRoomGeometry) -> Tensor:
     x0, y0 = position.unbind(-1)
     x1, y1 = target.unbind(-1)
     starts_inside = _in_slab(x0, geometry)
     ends_inside = _in_slab(x1, geometry)
-    crosses = starts_inside ^ ends_inside  # a step is shorter than the slab is wide: at most one face is met
+    crosses = starts_inside ^ ends_inside  # a step is shorter than the slab is wide: it crosses at most one face
 
-    # The face is the one on the side of whichever end lies outside the slab.
+    # The face that is crossed lies on the side of the end outside the slab.
     on_left = torch.where(starts_inside, x1, x0) < geometry.wall_center
     face = torch.where(on_left, geometry.face_left, geometry.face_right).to(x0.dtype)
     rest = torch.where(on_left, geometry.rest_left, geometry.rest_right).to(x0.dtype)
@@ -161,7 +192,7 @@ def _swept(position: Tensor, target: Tensor, geometry: TwoRoomGeometry) -> Tenso
     misses_door = crosses & ~_in_door(y0 + fraction * (y1 - y0), geometry)
 
     stopped = ends_inside & misses_door
-    # Kept between the jambs: whoever ends in the corridor, and whoever would leave it through a jamb.
+    # Clamped to the door: steps that end in the corridor, and steps that would leave it through a jamb.
     kept = ends_inside ^ misses_door
     x = torch.where(stopped, rest, x1)
     y = torch.where(kept, y1.clamp(geometry.door_low, geometry.door_high), y1)
@@ -176,51 +207,6 @@ def _endpoint(position: Tensor, target: Tensor, geometry: TwoRoomGeometry) -> Te
     x = torch.where(from_left & (x1 > geometry.face_left) & blocked, geometry.rest_left, x1)
     x = torch.where(~from_left & (x1 < geometry.face_right) & blocked, geometry.rest_right, x)
     return torch.stack((x, y1), dim=-1)  # [..., 2]
-
-
-def is_success(position: Tensor, goal: Tensor, *, geometry: TwoRoomGeometry = TWO_ROOM) -> Tensor:
-    """Tells whether the agent is strictly closer to the goal than the success radius.
-
-    Args:
-        position: [..., 2] float.
-        goal: [..., 2] float, broadcast against ``position``.
-        geometry: the scene.
-
-    Returns:
-        [...] bool.
-    """
-    return (position - goal).square().sum(-1).sqrt() < geometry.success_radius
-
-
-def in_wall(position: Tensor, *, geometry: TwoRoomGeometry = TWO_ROOM) -> Tensor:
-    """Tells whether the agent's centre is inside the obstacle, where no step can bring it.
-
-    Args:
-        position: [..., 2] float.
-        geometry: the scene.
-
-    Returns:
-        [...] bool; the faces and the jambs themselves are free.
-    """
-    x, y = position.unbind(-1)
-    return _in_slab(x, geometry) & ~_in_door(y, geometry)
-
-
-def is_legal(position: Tensor, *, geometry: TwoRoomGeometry = TWO_ROOM) -> Tensor:
-    """Tells whether an episode may start at a position: within the outer wall and not in the obstacle.
-
-    The published task starts up to one radius closer to the outer wall than any step can lead
-    (:attr:`TwoRoomGeometry.low`); such a start is legal and the first step moves it inwards.
-
-    Args:
-        position: [..., 2] float.
-        geometry: the scene.
-
-    Returns:
-        [...] bool; false for NaN.
-    """
-    inside = (position >= geometry.border) & (position <= geometry.canvas - geometry.border)
-    return inside.all(-1) & ~in_wall(position, geometry=geometry)
 
 
 def _in_slab(x: Tensor, geometry: TwoRoomGeometry) -> Tensor:

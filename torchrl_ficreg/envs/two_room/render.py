@@ -1,4 +1,4 @@
-"""Pictures of the two rooms: black walls on white, the agent a soft red disc.
+"""Pictures of TwoRoom: black walls on white, the agent a soft red disc.
 
 At 224 pixels the picture is the published one. Other resolutions show the same scene: the walls are area-averaged,
 so that thin lines fade instead of vanishing, and the disc is evaluated at the centres of the coarser pixels, so that
@@ -21,7 +21,7 @@ _FAINTEST = 1e-9
 _CHUNK_PIXELS = 1 << 17  # pixels blended at a time: keeps the float buffers of large batches in the cache
 
 
-def render(
+def render_pixels(
     position: Tensor, *, size: int = 224, goal: Tensor | None = None, geometry: TwoRoomGeometry = TWO_ROOM
 ) -> Tensor:
     """Draws the agent in its rooms.
@@ -30,10 +30,10 @@ def render(
     its largest value over the picture: the pixel nearest to the agent is pure red. Blended in float32, truncated.
 
     Args:
-        position: [..., 2] float, x and y of the agent on the canvas.
-        size: height and width of the picture, in pixels.
-        goal: [..., 2] float, drawn as a green disc beneath the agent; nothing is drawn by default.
-        geometry: the scene.
+        position (Tensor): [..., 2] float, x and y of the agent on the canvas.
+        size (int, optional): height and width of the picture, in pixels. Default: ``224``.
+        goal (Tensor, optional): [..., 2] float, drawn as a green disc below the agent. Default: ``None``, no goal.
+        geometry (TwoRoomGeometry, optional): the scene. Default: ``TWO_ROOM``.
 
     Returns:
         [..., 3, size, size] uint8, red, green, blue.
@@ -42,7 +42,7 @@ def render(
         ValueError: ``size`` is not a positive integer, or the shapes are wrong.
 
     Examples:
-        >>> picture = render(torch.tensor([[60.0, 112.0], [164.0, 49.0]]))
+        >>> picture = render_pixels(torch.tensor([[60.0, 112.0], [164.0, 49.0]]))
         >>> picture.shape, picture[0, :, 112, 60].tolist(), picture[1, :, 100, 112].tolist()
         (torch.Size([2, 3, 224, 224]), [255, 0, 0], [0, 0, 0])
     """
@@ -67,13 +67,13 @@ def render(
 
 
 def _blend(channels: list[Tensor], alpha: Tensor, color: tuple[float, float, float]) -> list[Tensor]:
-    """Lays a colour over each channel; channels that are equal before and after are computed once."""
+    """Blends a colour into each channel; channels that are equal before and after are computed once."""
     done: dict[tuple[int, float], Tensor] = {}
     for channel, value in zip(channels, color, strict=True):
         key = (id(channel), value)
         if key not in done:
             # Written as channel + alpha * (value - channel), so that a channel that already has the value keeps it:
-            # a float sum of the two shares may fall below it and be truncated to one grey level less.
+            # a float sum of the two terms may be below it and be truncated to one grey level less.
             done[key] = torch.addcmul(channel, alpha, value - channel)  # [n, size, size]
     return [done[id(channel), value] for channel, value in zip(channels, color, strict=True)]
 
@@ -84,9 +84,9 @@ def _disc(center: Tensor, size: int, geometry: TwoRoomGeometry) -> Tensor:
     # exp(-(dx^2 + dy^2)) is a product, so two lines of exponentials make the whole picture.
     squared = (center.unsqueeze(-1) - pixels).square()  # [n, 2, size]
     squared = squared - squared.amin(-1, keepdim=True)  # the division by the maximum, before the exponential
-    # exp2, because torch.exp of float64 wakes all of MKL's threads for these few numbers: on a busy CPU, 100x slower.
+    # exp2, because torch.exp of float64 uses all of MKL's threads for these few numbers: on a busy CPU, 100x slower.
     lines = torch.exp2(squared * (-0.5 * math.log2(math.e) / geometry.agent_radius**2))
-    # Shares too small to change a grey level become zero: products of them are subnormal, and slow to compute.
+    # Values too small to change a grey level become zero: their products are subnormal, and slow to compute.
     lines = torch.where(lines < _FAINTEST, 0.0, lines).to(torch.float32)
     return lines[:, 1, :, None] * lines[:, 0, None, :]  # rows are y, columns are x
 
@@ -102,11 +102,11 @@ def background(size: int, geometry: TwoRoomGeometry = TWO_ROOM) -> Tensor:
     """The empty rooms, as grey levels.
 
     Args:
-        size: height and width, in pixels.
-        geometry: the scene.
+        size (int): height and width, in pixels.
+        geometry (TwoRoomGeometry, optional): the scene. Default: ``TWO_ROOM``.
 
     Returns:
-        [size, size] float32 from 0 (wall) to 255 (floor). The result is shared between calls: do not write to it.
+        [size, size] float32 from 0 (wall) to 255 (floor). The result is cached and shared: do not write to it.
 
     Raises:
         ValueError: ``size`` is not a positive integer.

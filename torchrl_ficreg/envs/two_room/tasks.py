@@ -1,8 +1,9 @@
-"""Which starts and goals an episode of the two rooms is made of."""
+"""Tasks of TwoRoom: the draws of starts and goals, and the success rule."""
 
 from __future__ import annotations
 
 import numpy as np
+from torch import Tensor
 
 from torchrl_ficreg.envs.two_room.physics import TWO_ROOM, TwoRoomGeometry
 
@@ -10,11 +11,11 @@ MIN_STEPS = 25  # of a noiseless expert, as in the published data: 125 px throug
 
 
 def sample_start(rng: np.random.Generator, *, geometry: TwoRoomGeometry = TWO_ROOM) -> np.ndarray:
-    """Draws a start uniformly over the two rooms, the wall zone between their faces excluded.
+    """Draws a start uniformly over the two rooms, the slab of the wall excluded.
 
     Args:
-        rng: the source of randomness.
-        geometry: the scene.
+        rng (np.random.Generator): source of randomness.
+        geometry (TwoRoomGeometry, optional): the scene. Default: ``TWO_ROOM``.
 
     Returns:
         [2] float64, x and y.
@@ -37,10 +38,11 @@ def sample_goal(
     Far enough: ``(|start - door| + |door - goal|) / speed >= min_steps``.
 
     Args:
-        rng: the source of randomness.
-        start: [2] float, where the agent begins.
-        geometry: the scene.
-        min_steps: least number of full-speed steps along the path through the centre of the door.
+        rng (np.random.Generator): source of randomness.
+        start (np.ndarray): [2], where the agent begins.
+        geometry (TwoRoomGeometry, optional): the scene. Default: ``TWO_ROOM``.
+        min_steps (int, optional): least number of full-speed steps along the path through the centre of the door.
+            Default: ``25``.
 
     Returns:
         [2] float64, x and y.
@@ -68,9 +70,9 @@ def sample_task(
     """Draws a start and a goal in opposite rooms.
 
     Args:
-        rng: the source of randomness.
-        geometry: the scene.
-        min_steps: see :func:`sample_goal`.
+        rng (np.random.Generator): source of randomness.
+        geometry (TwoRoomGeometry, optional): the scene. Default: ``TWO_ROOM``.
+        min_steps (int, optional): see :func:`sample_goal`. Default: ``25``.
 
     Returns:
         start [2] and goal [2], float64.
@@ -82,3 +84,17 @@ def sample_task(
     """
     start = sample_start(rng, geometry=geometry)
     return start, sample_goal(rng, start, geometry=geometry, min_steps=min_steps)
+
+
+def is_success(position: Tensor, goal: Tensor, *, geometry: TwoRoomGeometry = TWO_ROOM) -> Tensor:
+    """Whether the agent is strictly closer to the goal than the success radius.
+
+    Args:
+        position (Tensor): [..., 2] float.
+        goal (Tensor): [..., 2] float, broadcast against ``position``.
+        geometry (TwoRoomGeometry, optional): the scene. Default: ``TWO_ROOM``.
+
+    Returns:
+        [...] bool.
+    """
+    return (position - goal).square().sum(-1).sqrt() < geometry.success_radius

@@ -1,4 +1,4 @@
-"""Calls reach the objects, results and exceptions come back, and no process outlives its owner."""
+"""A pool returns results and exceptions of its workers, in order where asked, and leaves no process behind."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import time
 import pytest
 import torch
 
-from torchrl_ficreg.envs.batched import Actors
-from torchrl_ficreg.envs.collect import ordered_map
+from torchrl_ficreg.envs._workers import ordered_map, WorkerPool
 
 
 class ComplicatedError(Exception):
-    """Pickles, but cannot be unpickled: its constructor wants two arguments and keeps one."""
+    """Pickles, but cannot be unpickled: its constructor takes two arguments and keeps one."""
 
     def __init__(self, first, second):
         super().__init__(f"{first} and {second}")
@@ -52,7 +51,7 @@ def gone(pid: int) -> bool:
     except ProcessLookupError:
         return True
     with open(f"/proc/{pid}/stat") as file:
-        return file.read().rpartition(")")[2].split()[0] == "Z"  # dead, and its parent has not looked yet
+        return file.read().rpartition(")")[2].split()[0] == "Z"  # dead, not yet waited for by its parent
 
 
 def wait_until(condition, seconds=20.0):
@@ -64,9 +63,9 @@ def wait_until(condition, seconds=20.0):
 
 @pytest.fixture(scope="module")
 def counters():
-    actors = Actors(Counter, 2)
-    yield actors
-    actors.close()
+    pool = WorkerPool(Counter, 2)
+    yield pool
+    pool.close()
 
 
 def test_each_object_keeps_its_own_state(counters):
@@ -75,7 +74,7 @@ def test_each_object_keeps_its_own_state(counters):
     assert counters.call("add", {1: (100,)}) == {1: before[1] + 110}
 
 
-def test_exceptions_arrive_with_their_words_and_the_object_lives_on(counters):
+def test_exceptions_are_raised_with_their_messages_and_the_object_remains(counters):
     before = counters.call("add", {0: (0,)})[0]
     with pytest.raises(KeyError, match="no such goal") as caught:
         counters.call("fail", {0: ("plain",), 1: ("plain",)})
@@ -92,7 +91,7 @@ def test_a_worker_has_one_thread_and_the_parent_keeps_its_environment(counters):
     assert "LP_NUM_THREADS" not in os.environ or os.environ["LP_NUM_THREADS"] != "0"
 
 
-def test_workers_leave_ctrl_c_to_their_parent(counters):
+def test_workers_ignore_sigint(counters):
     for pid in counters.pids:
         os.kill(pid, signal.SIGINT)
     assert len(counters.call("add", {0: (0,), 1: (0,)})) == 2
@@ -102,18 +101,17 @@ def test_workers_leave_ctrl_c_to_their_parent(counters):
 def test_workers_end_with_a_killed_parent():
     script = """
 import os, signal
-from torchrl_ficreg.envs.batched import Actors
-from torchrl_ficreg.envs.collect import ordered_map
-from test_batched_failures import Counter
+from torchrl_ficreg.envs._workers import WorkerPool
+from test_workers import Counter
 if __name__ == "__main__":
-    actors = Actors(Counter, 1)
-    actors.call("add", {0: (1,)})
-    print(*actors.pids, flush=True)
+    pool = WorkerPool(Counter, 1)
+    pool.call("add", {0: (1,)})
+    print(*pool.pids, flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 """
-    here = os.path.dirname(__file__)
+    path = os.pathsep.join([os.path.dirname(__file__), *filter(None, sys.path)])
     outcome = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": here}
+        [sys.executable, "-c", script], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}
     )
     assert outcome.returncode == -signal.SIGKILL, outcome.stderr
     pids = [int(word) for word in outcome.stdout.split()]
@@ -121,19 +119,18 @@ if __name__ == "__main__":
     assert wait_until(lambda: all(map(gone, pids)))
 
 
-def test_a_stopped_worker_is_warned_of_and_given_up(monkeypatch):
-    """Without a limit the call would wait for ever; a stopped process leaves no sign of its own."""
-    monkeypatch.setattr("torchrl_ficreg.envs.batched._WARN_SECONDS", 0.2)
-    monkeypatch.setattr("torchrl_ficreg.envs.batched._JOIN_SECONDS", 0.2)
-    actors = Actors(Counter, 2, timeout=600.0)
-    assert actors.call("add", {0: (1,), 1: (1,)}) == {0: 1, 1: 1}
-    actors._timeout = 1.0
-    os.kill(actors.pids[1], signal.SIGSTOP)
-    pids = actors.pids
+def test_a_stopped_worker_causes_a_warning_and_then_an_error(monkeypatch):
+    """A stopped process sends nothing and does not end: only the timeout finds it."""
+    monkeypatch.setattr("torchrl_ficreg.envs._workers._JOIN_SECONDS", 0.2)
+    pool = WorkerPool(Counter, 2, warn_after=0.2, timeout=600.0)
+    assert pool.call("add", {0: (1,), 1: (1,)}) == {0: 1, 1: 1}
+    pool._timeout = 1.0
+    os.kill(pool.pids[1], signal.SIGSTOP)
+    pids = pool.pids
     with pytest.warns(UserWarning, match=f"worker process 2 of 2.*{pids[1]}.*has not answered for 0 s"):
         with pytest.raises(TimeoutError, match="has not answered for 1 s: look whether it is stopped"):
-            actors.call("add", {0: (1,), 1: (1,)})
-    assert actors.closed
+            pool.call("add", {0: (1,), 1: (1,)})
+    assert pool.closed
     assert wait_until(lambda: all(map(gone, pids)))
 
 
@@ -152,9 +149,50 @@ def few_handles():
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
-@pytest.mark.parametrize("start", [lambda: Actors(Counter, 4), lambda: list(ordered_map(abs, range(8), num_workers=4))])
 @pytest.mark.parametrize("left", [1, 3, 8])
-def test_a_lack_of_file_handles_is_said_and_is_no_death(few_handles, start, left):
+def test_a_lack_of_file_handles_is_reported_as_such(few_handles, monkeypatch, left):
+    monkeypatch.setattr("torchrl_ficreg.envs._workers._JOIN_SECONDS", 0.1)
     few_handles(left)
     with pytest.raises(RuntimeError, match="too many open files to run the worker processes: raise the limit"):
-        start()
+        WorkerPool(Counter, 4)
+
+
+# ---------------------------------------------------------------------- ordered_map
+
+
+def slow_first_and_fails_at_50(item):
+    time.sleep(0.3 if item == 0 else 0.0)
+    if item == 50:
+        raise ValueError(f"{item} is too large")
+    return item
+
+
+def dies_at_two(item):
+    if item == 2:
+        os._exit(7)
+    return item
+
+
+def test_results_keep_the_order_of_the_items_which_are_drawn_only_as_needed():
+    """An exception is raised after the results before it."""
+    drawn = []
+
+    def items():
+        for item in range(60):
+            drawn.append(item)
+            yield item
+
+    results = ordered_map(slow_first_and_fails_at_50, items(), num_workers=2)
+    assert next(results) == 0
+    assert len(drawn) <= 4
+    assert [next(results) for _ in range(49)] == list(range(1, 50))
+    with pytest.raises(ValueError, match="50 is too large") as caught:
+        next(results)
+    cause = str(caught.value.__cause__)
+    assert "at item 50" in cause and "in slow_first_and_fails_at_50" in cause
+    assert len(drawn) <= 54
+
+
+def test_a_worker_that_dies_ends_the_map():
+    with pytest.raises(RuntimeError, match="worker process 1 of 1 died with exit code 7"):
+        list(ordered_map(dies_at_two, range(4), num_workers=1))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 
 import numpy as np
 import pytest
@@ -123,7 +122,7 @@ def test_imagining_is_stepping_by_hand(tiny_world, policy, history, context, bou
             seen, leading = torch.stack(latents[-history:], 1), torch.stack(blocks[-history:], 1)
             latents.append(model.predict(seen, leading)[:, -1])
     with torch.inference_mode():
-        plan = policy.imagine(model, latent, past, goal, horizon=5, bounds=bounds)
+        plan = policy.rollout(model, latent, past, goal, horizon=5, bounds=bounds)
     torch.testing.assert_close(plan, torch.stack(blocks[context - 1 :], 1))
     if bounds is not None:
         assert ((plan == -0.2) | (plan == 0.1)).any()
@@ -135,7 +134,7 @@ def test_the_plan_is_what_the_policy_does_along_the_rollout_of_the_plan(tiny_wor
     model = tiny_world(history=history)
     latent, past, goal = torch.randn(*lead, 2, 6), torch.randn(*lead, 1, 4), torch.randn(*lead, 6)
     with torch.no_grad():
-        plan = policy.imagine(model, latent, past, goal, horizon=4)
+        plan = policy.rollout(model, latent, past, goal, horizon=4)
         visited = model.rollout(latent, torch.cat([past, plan], -2))[..., :-1, :]
         visited = torch.cat([latent[..., -1:, :], visited], -2)  # where each block was chosen
         answers = policy.module(visited, goal.unsqueeze(-2).expand_as(visited))
@@ -148,9 +147,9 @@ def test_imagining_leaves_its_inputs_alone_and_keeps_their_dtype(tiny_world, pol
     inputs = torch.randn(4, 2, 6), torch.randn(4, 1, 4), torch.randn(4, 6)
     before = [value.clone() for value in inputs]
     with torch.inference_mode():
-        exact = policy.imagine(model, *inputs, horizon=3)
+        exact = policy.rollout(model, *inputs, horizon=3)
         model.predictor.to(torch.bfloat16)
-        rough = policy.imagine(model, *inputs, horizon=3)
+        rough = policy.rollout(model, *inputs, horizon=3)
     assert all(torch.equal(value, kept) for value, kept in zip(inputs, before))
     assert rough.dtype == torch.float32 and torch.equal(rough[:, 0], exact[:, 0])
     torch.testing.assert_close(rough, exact, rtol=0.05, atol=0.05)
@@ -169,7 +168,7 @@ def test_imagining_leaves_its_inputs_alone_and_keeps_their_dtype(tiny_world, pol
 )
 def test_imagining_from_other_shapes_is_refused(tiny_world, policy, latent, past, goal, horizon):
     with pytest.raises(ValueError, match=r"latents \[..., C, 6\], the C - 1 past blocks \[..., C - 1, 4\]"):
-        policy.imagine(tiny_world(), torch.zeros(latent), torch.zeros(past), torch.zeros(goal), horizon)
+        policy.rollout(tiny_world(), torch.zeros(latent), torch.zeros(past), torch.zeros(goal), horizon)
 
 
 @pytest.mark.parametrize("wrong", [([0.0], [1.0]), ([0.0] * 4, [1.0] * 3)])
@@ -177,12 +176,12 @@ def test_bounds_of_another_width_are_refused(tiny_world, policy, wrong):
     low, high = (torch.tensor(bound) for bound in wrong)
     with pytest.raises(ValueError, match=r"bounds must be two vectors \[4\]"):
         start, past = torch.zeros(2, 1, 6), torch.zeros(2, 0, 4)
-        policy.imagine(tiny_world(), start, past, torch.zeros(2, 6), 2, bounds=(low, high))
+        policy.rollout(tiny_world(), start, past, torch.zeros(2, 6), 2, bounds=(low, high))
 
 
 def test_imagining_with_a_world_model_of_other_widths_is_refused(tiny_world, policy):
     with pytest.raises(ValueError, match="latents of 6 and action blocks of 4, the world model 6 and 6"):
-        policy.imagine(tiny_world(3), torch.zeros(2, 1, 6), torch.zeros(2, 0, 6), torch.zeros(2, 6), 2)
+        policy.rollout(tiny_world(3), torch.zeros(2, 1, 6), torch.zeros(2, 0, 6), torch.zeros(2, 6), 2)
 
 
 # Learning
@@ -218,8 +217,8 @@ def walker(walkers):
     with pytest.warns(UserWarning, match="target_actor_network_params"):  # BCLoss has none, and TorchRL asks for them
         loss = BCLoss(policy, loss_function="l2")
     optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=600)
-    for _ in range(600):
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 6e-3, total_steps=250)
+    for _ in range(250):
         loss(walkers.sample(256, generator=generator))["loss_bc"].backward()
         optimizer.step()
         optimizer.zero_grad()
@@ -245,7 +244,7 @@ def test_a_plan_imagined_by_a_walker_arrives(walkers, walker, linear_world):
     rows = rows[rows["blocks"] == 3]
     start, goal = rows["latent"].unsqueeze(1), rows["goal_latent"]
     with torch.inference_mode():
-        plan = walker.imagine(world, start, torch.zeros(len(rows), 0, 8), goal, horizon=3)
+        plan = walker.rollout(world, start, torch.zeros(len(rows), 0, 8), goal, horizon=3)
         end = world.rollout(start, plan)[:, -1]
     missed = (end - goal).norm(dim=-1)
     assert len(rows) > 50 and missed.median() < 1.0, "of twelve steps of one unit"
@@ -319,7 +318,7 @@ def test_a_changed_configuration_is_refused(tiny_world, saved, field, value, mes
 
 
 def test_missing_and_damaged_files_are_named(tiny_world, saved, tmp_path):
-    with pytest.raises(FileNotFoundError, match="no policy.json in .*nowhere: train a policy with train_policy.py"):
+    with pytest.raises(FileNotFoundError, match="no policy.json in .*nowhere: give a folder that save_goal_policy"):
         load_goal_policy(tmp_path / "nowhere", tiny_world())
     weights, config = saved / "policy.safetensors", saved / "policy.json"
     whole = weights.read_bytes()
@@ -333,34 +332,14 @@ def test_missing_and_damaged_files_are_named(tiny_world, saved, tmp_path):
 
 
 @pytest.mark.parametrize("field", ["latent_dim", "hidden_dim", "depth"])
-@pytest.mark.parametrize("size", [10**7, 10**30, -1, float("nan"), True, "3", [1]])
-def test_sizes_that_the_weights_do_not_have_are_refused_before_anything_is_built(tiny_world, saved, field, size):
-    content = json.loads((saved / "policy.json").read_text())
-    content["sizes"][field] = size
-    (saved / "policy.json").write_text(json.dumps(content))
-    with pytest.raises(ValueError, match="do not belong together") as caught:
-        load_goal_policy(saved, tiny_world())
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("at", range(1, 5))
-def test_a_save_that_fails_at_any_write_leaves_a_whole_policy(tiny_world, saved, at, monkeypatch):
-    before = {path.name: path.read_bytes() for path in saved.iterdir()}
-    replace, calls = os.replace, []
-
-    def failing(source, target):
-        calls.append(target)
-        if len(calls) == at:
-            raise OSError("No space left on device")
-        replace(source, target)
-
-    monkeypatch.setattr(os, "replace", failing)
-    with pytest.raises(OSError):
-        save_goal_policy(GoalPolicy(6, 4, hidden_dim=8, depth=1), saved, tiny_world())
-    monkeypatch.undo()
-    assert load_goal_policy(saved, tiny_world()).sizes["hidden_dim"] == (16 if at < 4 else 8)
-    if at < 4:
-        assert {path.name: path.read_bytes() for path in saved.iterdir()} == before
+def test_sizes_that_the_weights_do_not_have_are_refused_before_anything_is_built(tiny_world, saved, field):
+    content, world_model = json.loads((saved / "policy.json").read_text()), tiny_world()
+    for size in (10**7, 10**30, -1, float("nan"), True, "3", [1]):
+        content["sizes"][field] = size
+        (saved / "policy.json").write_text(json.dumps(content))
+        with pytest.raises(ValueError, match="do not belong together") as caught:
+            load_goal_policy(saved, world_model)
+        assert "\n" not in str(caught.value)
 
 
 def test_a_policy_with_a_flipped_byte_or_a_nan_is_refused(tiny_world, policy, saved):

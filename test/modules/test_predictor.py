@@ -59,7 +59,7 @@ def test_imagining_computes_each_token_of_a_growing_window_once(predictor, conte
     """Six blocks from C frames on: one token a step until the window of three slides, then all three."""
     tokens = []
     hook = predictor.module.blocks[0].mlp.register_forward_pre_hook(lambda _, x: tokens.append(x[0].shape[1]))
-    imagined = predictor.module.imagine(torch.randn(2, context, 6), torch.randn(2, context + 5, 4))
+    imagined = predictor.module.rollout(torch.randn(2, context, 6), torch.randn(2, context + 5, 4))
     hook.remove()
     assert imagined.shape == (2, 6, 6)
     assert tokens == {1: [1, 1, 1, 3, 3, 3], 2: [2, 1, 3, 3, 3, 3], 3: [3] * 6, 4: [3] * 6}[context]
@@ -68,7 +68,7 @@ def test_imagining_computes_each_token_of_a_growing_window_once(predictor, conte
 def test_the_last_layer_computes_the_last_token_alone(predictor):
     tokens = []
     predictor.module.blocks[-1].mlp.register_forward_pre_hook(lambda _, x: tokens.append(x[0].shape[1]))
-    predictor.module.imagine(torch.randn(2, 1, 6), torch.randn(2, 6, 4))
+    predictor.module.rollout(torch.randn(2, 1, 6), torch.randn(2, 6, 4))
     assert tokens == [1] * 6
 
 
@@ -97,8 +97,8 @@ def test_the_action_embedding_is_two_layers_after_a_bottleneck():
 @pytest.mark.parametrize(
     ("latent", "action", "message"),
     [
-        ((2, 4, 6), (2, 4, 4), "sees 1 to 3 latents, got 4"),
-        ((2, 0, 6), (2, 0, 4), "sees 1 to 3 latents, got 0"),
+        ((2, 4, 6), (2, 4, 4), "takes 1 to 3 latents, got 4"),
+        ((2, 0, 6), (2, 0, 4), "takes 1 to 3 latents, got 0"),
         ((2, 3, 5), (2, 3, 4), "latents must be 6 wide, got 5"),
         ((2, 3, 6), (2, 3, 2), "action blocks must be 4 wide .* got 2"),
     ],

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 import torch.nn.functional as F
 
-from torchrl_ficreg.modules.transformer import AdaptiveBlock, attend, Attention, Block, FeedForward
+from torchrl_ficreg import ViTEncoder
+from torchrl_ficreg.modules.transformer import AdaptiveBlock, attend, attend_by_products, Attention, Block, FeedForward
 
 
+@pytest.mark.parametrize("way", [attend, attend_by_products])
 @pytest.mark.parametrize("causal", [False, True])
 @pytest.mark.parametrize("tokens", [1, 3, 17])
-def test_attend_is_scaled_dot_product_attention(causal, tokens):
+def test_attend_is_scaled_dot_product_attention(causal, tokens, way):
     """In value and gradient."""
     inputs = [torch.randn(2, 3, tokens, 8, dtype=torch.float64, requires_grad=True) for _ in range(3)]
-    ours = attend(*inputs, causal)
+    ours = way(*inputs, causal)
     theirs = F.scaled_dot_product_attention(*inputs, is_causal=causal)
     torch.testing.assert_close(ours, theirs)
     gradients = (torch.autograd.grad(value, inputs, torch.ones_like(value).cumsum(-1)) for value in (ours, theirs))
@@ -26,6 +30,15 @@ def test_attend_keeps_bfloat16():
     result = attend(*(value.bfloat16() for value in inputs), True)
     assert result.dtype == torch.bfloat16
     torch.testing.assert_close(result.float(), attend(*inputs, True), rtol=0.1, atol=0.05)
+
+
+@pytest.mark.parametrize("tokens", [3, 17])
+def test_attention_without_gradients_is_that_of_training(tokens):
+    """Few tokens take a way of their own there."""
+    attention, x = Attention(12, 2, 5, causal=True, qkv_bias=True).double(), torch.randn(2, tokens, 12, dtype=torch.float64)
+    expected = attention(x)
+    with torch.no_grad():
+        torch.testing.assert_close(attention(x), expected)
 
 
 @pytest.mark.parametrize("causal", [False, True])
@@ -99,7 +112,63 @@ def test_attention_weights_are_dropped_in_training_alone():
     x = torch.randn(1, 3, 8)
     expected = attention.eval()(x)
     assert attention(x).equal(expected)
-    attention.train()
-    draws = torch.stack([attention(x).detach() for _ in range(4000)])
+    draws = attention.train()(x.expand(4000, -1, -1))
     assert not draws[0].equal(draws[1])
-    torch.testing.assert_close(draws.mean(0), expected, rtol=0, atol=0.05)
+    torch.testing.assert_close(draws.mean(0, keepdim=True), expected, rtol=0, atol=0.05)
+
+
+def vision_transformer():
+    return ViTEncoder(image_size=16, patch_size=4, width=12, depth=2, heads=3, mlp_dim=16, projector_dim=12)
+
+
+@pytest.mark.parametrize(("training", "dtype"), [(True, None), (False, torch.bfloat16)])
+def test_a_vision_transformer_compiles_into_one_graph(training, dtype):
+    encoder, pixels = vision_transformer().train(training), torch.randint(0, 256, (4, 3, 16, 16), dtype=torch.uint8)
+    with torch.autocast("cpu", dtype, enabled=dtype is not None):
+        latent = torch.compile(encoder.module, backend="eager", fullgraph=True)(pixels)
+    assert latent.shape == (4, 192) and latent.isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", [None, torch.bfloat16])
+def test_transforms_of_torch_func_see_through_a_block(dtype):
+    """``vmap`` is the loop over its dimension; per-sample gradients add up to the gradient of the batch."""
+    block = Block(12, 3, 16)
+    x, params = torch.randn(5, 4, 12), dict(block.named_parameters())
+
+    def objective(params, x):
+        return torch.func.functional_call(block, params, (x,)).float().square().sum()
+
+    with torch.autocast("cpu", dtype, enabled=dtype is not None):
+        expected = torch.func.grad(objective)(params, x)
+        found = torch.vmap(torch.func.grad(objective), (None, 0))(params, x.unsqueeze(1))
+        mapped = torch.vmap(block)(x.unsqueeze(1)).squeeze(1)
+        whole = block(x)
+    tolerance = 1e-5 if dtype is None else 5e-2
+    for name, gradient in expected.items():
+        scale = gradient.abs().max().item()
+        torch.testing.assert_close(found[name].sum(0), gradient, rtol=0, atol=tolerance * max(scale, 1))
+    torch.testing.assert_close(mapped, whole, rtol=0, atol=tolerance * whole.abs().max().item())
+
+
+def test_the_first_token_of_a_block_costs_less_and_is_the_same():
+    """In value, and in every gradient."""
+    block = Block(12, 3, 16).double()
+    x = torch.randn(4, 9, 12, dtype=torch.float64, requires_grad=True)
+    results = []
+    for call in (block.first, lambda tokens: block(tokens)[:, :1]):
+        result = call(x)
+        weight = torch.ones_like(result).cumsum(-1)
+        results.append((result, *torch.autograd.grad(result, [x, *block.parameters()], weight)))
+    torch.testing.assert_close(*results)
+
+
+def test_a_vision_transformer_trains_as_it_infers():
+    """With gradients, its latents are those without; a copy gets the same gradients."""
+    encoder = vision_transformer().eval()
+    other, pixels = copy.deepcopy(encoder), torch.randint(0, 256, (3, 3, 16, 16), dtype=torch.uint8)
+    with torch.no_grad():
+        expected = encoder(pixels=pixels)
+    torch.testing.assert_close(encoder(pixels=pixels), expected)
+    for network in (encoder, other):
+        network(pixels=pixels).square().sum().backward()
+    assert all(mine.grad.equal(theirs.grad) for mine, theirs in zip(encoder.parameters(), other.parameters()))

@@ -8,8 +8,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
-from torchrl_ficreg import CausalPredictor, ConvEncoder, LatentCEMPlanner, LatentWorldModel, PlanConfig
+from torchrl_ficreg import CausalPredictor, CEMConfig, ConvEncoder, LatentCEMPlanner, LatentWorldModel
 from torchrl_ficreg.data import ActionStatistics
+from torchrl_ficreg.planners.dynamics import plans_in_bf16
 
 
 def by_hand(model, latent, action):
@@ -59,48 +60,63 @@ def with_predictor(predictor, **kwargs):
     return LatentWorldModel(encoder, predictor, **{"frame_skip": 2, **kwargs}).eval()
 
 
-def test_a_predictor_of_ones_own_says_its_sizes_itself_or_in_its_network():
-    """In a single module or in a sequence of them; the rollout is the same."""
-    network = Own(**SIZES)
-    single = with_predictor(TensorDictModule(network, ["latent", "action"], ["predicted_latent"]))
-    sequence = TensorDictSequential(TensorDictModule(network, ["latent", "action"], ["predicted_latent"]))
-    vars(sequence).update(SIZES)
+def own(**sizes):
+    return TensorDictModule(Own(**sizes), ["latent", "action"], ["predicted_latent"])
+
+
+@pytest.mark.parametrize("sequence", [False, True])
+@pytest.mark.parametrize("said_by", ["arguments", "attributes", "both"])
+def test_sizes_come_from_the_predictor_or_from_arguments(said_by, sequence):
+    """Those of a network may stand in it or in the module that wraps it; the rollout is that of predict()."""
+    predictor = own(**({} if said_by == "arguments" or sequence else SIZES))
+    if sequence:
+        predictor = TensorDictSequential(predictor)
+        vars(predictor).update({} if said_by == "arguments" else SIZES)
+    model = with_predictor(predictor, **({} if said_by == "attributes" else SIZES))
+    assert (model.latent_dim, model.block_dim, model.history) == (6, 4, 2)
     latent, action = torch.randn(3, 1, 6), torch.randn(3, 4, 4)
-    expected = single.rollout(latent, action)
-    assert with_predictor(sequence).rollout(latent, action).equal(expected)
-    torch.testing.assert_close(expected, by_hand(single, latent, action))
+    torch.testing.assert_close(model.rollout(latent, action), by_hand(model, latent, action))
 
 
-@pytest.mark.parametrize("missing", SIZES)
-def test_a_predictor_without_sizes_is_told_which(missing):
-    network = Own(**{name: size for name, size in SIZES.items() if name != missing})
-    with pytest.raises(TypeError, match=f"a predictor of your own says .*: give it, or its network, {missing}"):
-        with_predictor(TensorDictModule(network, ["latent", "action"], ["predicted_latent"]))
+@pytest.mark.parametrize("name", SIZES)
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({}, TypeError, r"the predictor has no attribute {0}: give it one, or LatentWorldModel\(..., {0}=\)"),
+        ({"given": 8, "said": 4}, ValueError, "{0}=8 differs from {0}=4 of the predictor"),
+        ({"given": 0}, ValueError, "{0} must be a positive integer, got 0"),
+        ({"said": 2.0}, ValueError, "{0} must be a positive integer, got 2.0"),
+        ({"given": True}, ValueError, "{0} must be a positive integer, got True"),
+    ],
+)
+def test_sizes_that_are_missing_or_contradict_each_other_are_refused(name, change, error, message):
+    said = {**SIZES, name: change.get("said")}
+    with pytest.raises(error, match=message.format(name)):
+        with_predictor(own(**said), **{name: change.get("given")})
 
 
 def test_a_plain_module_and_a_frame_skip_that_is_none_are_refused():
     with pytest.raises(TypeError, match="the predictor must be a TensorDictModule, got a Own: wrap a network as"):
         with_predictor(Own(**SIZES))
-    predictor = TensorDictModule(Own(**SIZES), ["latent", "action"], ["predicted_latent"])
     for wrong in (0, -2, 2.0):
-        with pytest.raises(ValueError, match="frame_skip must be a whole number of at least 1 action, got"):
-            with_predictor(predictor, frame_skip=wrong)
+        with pytest.raises(ValueError, match="frame_skip must be a positive integer, got"):
+            with_predictor(own(**SIZES), frame_skip=wrong)
 
 
 def test_left_to_choose_a_planner_does_not_cast_a_network_of_ones_own(monkeypatch):
     """Wherever bfloat16 is fast: it may not bear the rounding, or, as here, the cast. A network of the package does."""
-    monkeypatch.setattr("torchrl_ficreg.planners.base.uses_bf16", lambda device, chosen: chosen != "fp32")
+    monkeypatch.setattr("torchrl_ficreg.planners.dynamics.uses_bf16", lambda device, chosen: chosen != "fp32")
     settings = {"num_candidates": 8, "num_elites": 2, "iterations": 2}
-    model = with_predictor(TensorDictModule(Own(**SIZES), ["latent", "action"], ["predicted_latent"]))
+    model = with_predictor(own(**SIZES))
     plans = [
-        LatentCEMPlanner(model, PlanConfig(**settings, precision=precision), action_bounds=([-1, -1], [1, 1])).plan(
+        LatentCEMPlanner(model, CEMConfig(**settings, precision=precision), action_bounds=([-1, -1], [1, 1])).plan(
             torch.zeros(2, 6), torch.ones(2, 6)
         )
         for precision in ("auto", "fp32")
     ]
     assert plans[0]["plan"].equal(plans[1]["plan"])
     predictor = CausalPredictor(latent_dim=6, action_dim=4, history=1, depth=1)
-    assert LatentCEMPlanner(with_predictor(predictor), PlanConfig(bounds="none"))._wants_bf16_copy()
+    assert plans_in_bf16(with_predictor(predictor), "auto")
 
 
 def test_a_rollout_is_differentiable_in_its_actions(tiny_world):
@@ -133,18 +149,104 @@ def test_a_rollout_with_blocks_of_another_width_is_refused(tiny_world):
         tiny_world().rollout(torch.zeros(2, 1, 6), torch.zeros(2, 2, 2))
 
 
-def test_forward_encodes_and_predicts_and_leaves_its_input_alone(tiny_world):
-    model = tiny_world(history=2)
-    pixels = torch.randint(0, 256, (4, 3, 3, 16, 16), dtype=torch.uint8)
-    clip = TensorDict({"pixels": pixels, "action": torch.randn(4, 3, 4)}, [4, 3])
+def a_clip(batch_size, pixels="pixels", action="action"):
+    frames = torch.randint(0, 256, (4, 3, 3, 16, 16), dtype=torch.uint8)
+    return TensorDict({pixels: frames, action: torch.randn(4, 3, 4), "reward": torch.randn(4, 3, 1)}, batch_size)
+
+
+@pytest.mark.parametrize("batch_size", [[], [4], [4, 3]])
+def test_forward_encodes_and_predicts_and_keeps_every_other_entry(tiny_world, batch_size):
+    """In place, but where the batch size counts the frames, of which one has no prediction."""
+    model, clip = tiny_world(history=2), a_clip(batch_size)
     before = clip.clone()
     output = model(clip)
-    assert set(clip.keys()) == {"pixels", "action"}
-    assert (clip == before).all()
-    assert set(output.keys()) == {"latent", "predicted_latent"}
-    torch.testing.assert_close(output["latent"], model.encode(pixels))
+    assert set(output.keys()) == {*before.keys(), "latent", "predicted_latent"}
+    assert all(output[key].equal(before[key]) for key in before.keys())
+    torch.testing.assert_close(output["latent"], model.encode(clip["pixels"]))
     expected = model.predict(output["latent"][:, :-1], clip["action"][:, :-1])
     torch.testing.assert_close(output["predicted_latent"], expected)
+    if batch_size == [4, 3]:
+        assert output.batch_size == (4,) and set(clip.keys()) == set(before.keys()) and clip.batch_size == (4, 3)
+    else:
+        assert output is clip
+
+
+def test_a_world_model_works_in_a_sequence_and_by_keyword(tiny_world):
+    model, clip = tiny_world(history=2), a_clip([4, 3])
+    error = TensorDictModule(
+        lambda latent, predicted: (latent[:, 1:] - predicted).square().sum(-1), ["latent", "predicted_latent"], ["error"]
+    )
+    output = TensorDictSequential(model, error)(clip)
+    assert output["error"].shape == (4, 2) and output["reward"].equal(clip["reward"])
+    latent, predicted = model(pixels=clip["pixels"], action=clip["action"])
+    assert latent.equal(output["latent"]) and predicted.equal(output["predicted_latent"])
+
+
+def test_keys_can_be_renamed_nested_too(tiny_world):
+    """By the constructor and by ``set_keys``, whatever the keys of the networks are."""
+    model, clip = tiny_world(history=2), a_clip([4])
+    expected = model(clip.clone())
+    keys = {"pixels": ("camera", "rgb"), "action": "u", "latent": ("next", "z"), "predicted_latent": ("next", "guess")}
+    names = list(keys.values())
+    model.set_keys(**keys)
+    built = LatentWorldModel(model.encoder, model.predictor, frame_skip=2, in_keys=names[:2], out_keys=names[2:]).eval()
+    renamed = clip.rename_key_("pixels", keys["pixels"]).rename_key_("action", "u")
+    for renamed_model in (model, built):
+        assert (renamed_model.in_keys, renamed_model.out_keys) == (names[:2], names[2:])
+        output = renamed_model(renamed.clone())
+        assert output["next", "z"].equal(expected["latent"])
+        assert output["next", "guess"].equal(expected["predicted_latent"])
+    model.set_keys(pixels=None)
+    assert model.in_keys == ["pixels", "u"]
+    with pytest.raises(ValueError, match="no key reward: choose among pixels, action, latent, predicted_latent"):
+        model.set_keys(reward="r")
+    with pytest.raises(RuntimeError, match="key should be a"):
+        model.set_keys(pixels="image", action=3)
+    assert model.in_keys == [model.tensor_keys.pixels, model.tensor_keys.action] == ["pixels", "u"]
+    with pytest.raises(ValueError, match=r"in_keys \[pixels, action\] and out_keys \[latent, predicted_latent\], got"):
+        LatentWorldModel(model.encoder, model.predictor, frame_skip=2, in_keys=["pixels"])
+
+
+def test_renaming_what_is_written_selects_no_other_output(tiny_world):
+    """Of networks that write several entries; the entry is the one of the new name only where they write it."""
+    model, clip = tiny_world(history=2), a_clip([4])
+    expected = model(clip.clone())
+    model = LatentWorldModel(
+        *(
+            TensorDictModule(lambda *inputs, of=of: (out := of(*inputs), out + 1), keys, [*of.out_keys, "other"])
+            for of, keys in ((model.encoder, ["pixels"]), (model.predictor, ["latent", "action"]))
+        ),
+        frame_skip=2,
+        latent_dim=6,
+        action_dim=4,
+        history=2,
+    ).eval()
+    for keys in ({}, {"latent": ("agent", "z"), "predicted_latent": "guess"}):
+        model.set_keys(**keys)
+        output = model(clip.clone())
+        for key, name in zip(("latent", "predicted_latent"), model.out_keys):
+            torch.testing.assert_close(output[name], expected[key])
+    model.set_keys(latent="other")
+    torch.testing.assert_close(model.encode(clip["pixels"]), expected["latent"] + 1)
+    unnamed = LatentWorldModel(
+        TensorDictModule(lambda x: (x, x), ["pixels"], ["code", "other"]), model.predictor, frame_skip=2, latent_dim=6,
+        action_dim=4, history=2,
+    )
+    with pytest.raises(KeyError, match=r"no 'latent' among \['code', 'other'\], what the network writes: see set_keys"):
+        unnamed.encode(clip["pixels"])
+
+
+def test_a_lazy_stack_of_clips_is_read_as_a_batch(tiny_world):
+    model, clip = tiny_world(history=2), a_clip([4, 3])
+    output = model(TensorDict.lazy_stack(list(clip)))
+    expected = model(clip)
+    assert output.batch_size == (4,) and set(output.keys()) == set(expected.keys())
+    torch.testing.assert_close(output["predicted_latent"], expected["predicted_latent"])
+
+
+def test_a_missing_entry_is_named(tiny_world):
+    with pytest.raises(KeyError, match="the world model reads 'action', which is missing"):
+        tiny_world()(a_clip([4]).exclude("action"))
 
 
 def test_statistics_are_part_of_the_state(tiny_world):

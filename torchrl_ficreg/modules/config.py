@@ -1,4 +1,4 @@
-"""Named sizes of the world model, and the one place that builds networks from numbers."""
+"""Configuration of a world model: its sizes, named presets, and :func:`make_world_model`, which builds it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Everything needed to build the networks again, apart from the environment's action space.
+    """All sizes of the package's networks, apart from the action dimension of the environment.
+
+    The comment of each field says what it is.
 
     Raises:
         ValueError: an unknown encoder or a size that is not positive.
@@ -25,7 +27,7 @@ class ModelConfig:
     image_size: int = 224  # H = W of the frames, pixels
     frame_skip: int = 5  # F, environment steps between two frames of a clip
     latent_dim: int = 192  # D
-    history: int = 3  # H, latents the predictor sees
+    history: int = 3  # H, most latents that the predictor takes at once
     encoder_init: Literal["torch", "published"] = "torch"  # of the "vit" encoder, see :class:`VisionTransformer`
     conv_channels: tuple[int, ...] = (16, 32, 64, 128)  # of the "conv" encoder; each layer halves the frame
     encoder_projector_dim: int = 2048  # hidden width of the BatchNorm projector of the "vit" and "conv" encoders
@@ -45,7 +47,7 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         for name in ("conv_channels", "keypoint_channels"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))  # JSON and YAML know lists only
+            object.__setattr__(self, name, tuple(getattr(self, name)))  # JSON and YAML have lists only
         if self.encoder not in ("vit", "conv", "keypoint"):
             raise ValueError(f"unknown encoder {self.encoder!r}: choose 'vit', 'conv' or 'keypoint'.")
         if self.encoder_init not in get_args(Init):
@@ -67,13 +69,16 @@ class ModelConfig:
 
     @classmethod
     def preset(cls, name: str, **changes) -> ModelConfig:
-        """A named size, with some of its numbers changed.
+        """A named configuration, with some fields changed.
 
         Args:
-            name: ``"paper"``, ViT-Tiny/14 at 224 pixels (18.0 M parameters in the world model, arXiv 2603.19312) with
+            name (str): ``"paper"``, ViT-Tiny/14 at 224 pixels (18.0 M parameters in the world model, arXiv 2603.19312) with
                 the initialisation of the published code; ``"gpu_short"``, the same at 112 pixels; or ``"cpu"``, a
                 convolutional encoder at 64 pixels that trains in minutes on two cores.
-            **changes: fields to set otherwise.
+            **changes: fields with other values.
+
+        Raises:
+            ValueError: an unknown name, or a value out of range.
         """
         if name not in PRESETS:
             raise ValueError(f"unknown preset {name!r}: choose one of {sorted(PRESETS)}.")
@@ -100,11 +105,14 @@ PRESETS = {
 
 
 def make_world_model(config: ModelConfig, action_dim: int) -> tuple[LatentWorldModel, InverseDynamicsModel]:
-    """Builds the world model and the inverse dynamics model that judges it.
+    """Builds a world model and an inverse dynamics model of the package's own networks.
 
     Args:
-        config: sizes; see :meth:`ModelConfig.preset`.
-        action_dim: raw action dimension A of the environment.
+        config (ModelConfig): sizes; see :meth:`ModelConfig.preset`.
+        action_dim (int): A, action dimension of the environment.
+
+    Returns:
+        the world model and the inverse dynamics model, in training mode.
 
     Examples:
         >>> model, _ = make_world_model(ModelConfig.preset("paper"), action_dim=2)

@@ -9,19 +9,20 @@ from torch import nn
 
 from torchrl_ficreg._device import convolution_region
 from torchrl_ficreg.keys import LATENT, PIXELS
-from torchrl_ficreg.modules.layers import channels_last, PixelNormalizer, Projector, restore_lead
+from torchrl_ficreg.modules.layers import channels_last, keep_arguments, PixelNormalizer, Projector, unflatten_batch
 
 
 class ConvNetwork(nn.Module):
-    """Strided 4x4 convolutions, each halving the frame, and a BatchNorm projector on what is left.
+    """Strided 4x4 convolutions, each halving the frame, and a BatchNorm projector on the flattened feature maps.
 
     Args:
-        image_size: H = W of the frames, a multiple of 2 ** len(channels).
-        channels: output channels of each convolution.
-        projector_dim: hidden width of the projector.
-        latent_dim: D.
+        image_size (int, optional): H = W of the frames, a multiple of 2 ** len(channels). Default: ``64``.
+        channels (tuple of int, optional): output channels of each convolution. Default: ``(16, 32, 64, 128)``.
+        projector_dim (int, optional): hidden width of the projector. Default: ``128``.
+        latent_dim (int, optional): D. Default: ``16``.
     """
 
+    @keep_arguments
     def __init__(
         self,
         *,
@@ -37,7 +38,7 @@ class ConvNetwork(nn.Module):
         layers: list[nn.Module] = []
         for into, out in zip((3, *channels), channels):
             layers += [nn.Conv2d(into, out, kernel_size=4, stride=2, padding=1), nn.GELU()]
-        # Channels last is the layout that CPU kernels for bfloat16 want.
+        # Channels last: the layout of bfloat16 convolutions on CPUs.
         self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)
         left = image_size // 2 ** len(channels)
         self.projector = Projector(channels[-1] * left**2, projector_dim, latent_dim)
@@ -47,15 +48,16 @@ class ConvNetwork(nn.Module):
         frames = channels_last(self.normalize(pixels))  # [N, 3, H, W]
         with convolution_region(frames.device):
             maps = self.convolutions(frames)  # [N, C, H', W']
-        return restore_lead(self.projector(maps.flatten(1)), pixels)
+        return unflatten_batch(self.projector(maps.flatten(1)), pixels)
 
 
 class ConvEncoder(TensorDictModule):
     """Encoder for small frames: ``pixels`` [..., 3, H, W] -> ``latent`` [..., D]. 0.4 M parameters, made for CPUs.
 
     Args:
-        in_key, out_key: where frames are read and latents are written.
-        **network: see :class:`ConvNetwork`.
+        in_key (NestedKey, optional): where frames are read. Default: ``"pixels"``.
+        out_key (NestedKey, optional): where latents are written. Default: ``"latent"``.
+        **network: arguments of :class:`ConvNetwork`.
 
     Raises:
         TypeError, ValueError: see :class:`~torchrl_ficreg.modules.layers.PixelNormalizer`.

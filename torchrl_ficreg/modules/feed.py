@@ -1,4 +1,4 @@
-"""Networks are fed by the names of their keys, and by position only where no name says which tensor is meant."""
+"""Passes tensors to a network by the names of its ``in_keys``; by position where the names do not tell them apart."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from tensordict import is_tensor_collection, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 
-from torchrl_ficreg.keys import ACTION, GOAL_LATENT, LATENT, PIXELS, PREDICTED_LATENT
+from torchrl_ficreg._torchrl_compat import keyword_arguments
+from torchrl_ficreg.keys import ACTION, GOAL_LATENT, LATENT, NEXT_LATENT, PIXELS, PREDICTED_LATENT
 
-NEXT_LATENT = "next_latent"  # contract name of the latent a transition leads to; ("next", "latent") is the same
-_MARKS = {NEXT_LATENT: "next", GOAL_LATENT: "goal"}  # what tells the key of such a latent from that of another one
+_MARKS = {NEXT_LATENT: "next", GOAL_LATENT: "goal"}  # parts of a key that mark these latents
 
 Names = Mapping[str, Sequence[NestedKey]]
 
@@ -24,38 +24,39 @@ def feed(
     names: Names | None = None,
     batch_size: Iterable[int] = (),
 ) -> TensorDict:
-    """The tensordict that a module reads its inputs from; see :func:`arrange` for which key gets which tensor.
+    """Builds the tensordict that a module reads its inputs from; :func:`arrange` says which key gets which tensor.
 
     Args:
-        owner: what the module is called in an error, such as ``"predictor"``.
-        module: any TensorDictModule.
-        inputs: tensors by contract name, in the order of positions.
-        names: further names of each input.
-        batch_size: of the tensordict.
+        owner (str): name of the module in errors, such as ``"predictor"``.
+        module (TensorDictModuleBase): the module.
+        inputs (mapping of str to Tensor): tensors by contract name, in the order of positions.
+        names (mapping of str to sequence of NestedKey, optional): further names of each input. Default: none.
+        batch_size (iterable of int, optional): of the tensordict. Default: ``()``.
 
     Raises:
         ValueError: see :func:`arrange`.
     """
     names = {role: (names or {}).get(role, ()) for role in inputs}
-    roles = arrange(owner, module.in_keys, names, getattr(module, "_kwargs", None))
+    roles = arrange(owner, module.in_keys, names, keyword_arguments(module))
     return TensorDict({key: inputs[role] for key, role in zip(module.in_keys, roles)}, batch_size)
 
 
 def arrange(
     owner: str, in_keys: Sequence[NestedKey], names: Names, arguments: Sequence[str] | None = None
 ) -> list[str]:
-    """Which input each ``in_key`` of a network gets.
+    """Assigns an input to each ``in_key`` of a network.
 
-    A key belongs to an input by, in this order: one of its further names, its contract name, the last part of either in
-    a nested key, and the keyword argument that the key is passed to. A key with a part ``"next"`` or a last part
-    ``"next_*"`` or ``"*_next"`` is the latent a transition leads to, and so for ``"goal"``. A key that no name claims gets
-    the input that is left; where no key is claimed, position decides.
+    A key is matched to an input by the first of these that applies: one of the input's further names, its contract name,
+    the last part of either in a nested key, the keyword argument that the key is passed to. A key with a part ``"next"``
+    or a last part ``"next_*"`` or ``"*_next"`` is the latent after a transition, and likewise for ``"goal"``. A key
+    without a match gets the remaining input; if no key has a match, position decides.
 
     Args:
-        owner: what the network is called in an error.
-        in_keys: of the network.
-        names: further names of each input by its contract name, in the order of positions.
-        arguments: keyword argument of each ``in_key``, where the network has some.
+        owner (str): name of the network in errors.
+        in_keys (sequence of NestedKey): of the network.
+        names (mapping of str to sequence of NestedKey): further names of each input by its contract name, in the order of
+            positions.
+        arguments (sequence of str, optional): keyword argument of each ``in_key``. Default: none.
 
     Returns:
         contract names, one for each of ``in_keys``.
@@ -88,12 +89,12 @@ def arrange(
         raise _contradiction(owner, in_keys, names)
     roles = [roles[0] if roles else next(left) for roles in claims]
     if claimed == [LATENT] and roles[0] != LATENT and not _MARKS.keys().isdisjoint(names):
-        raise _contradiction(owner, in_keys, names)  # ("x", "latent"): which of two latents the first one is, is not said
+        raise _contradiction(owner, in_keys, names)  # ("x", "latent"): "x" may be either of two latents
     return roles
 
 
 def sort_keys(owner: str, in_keys: Sequence[NestedKey], *roles: str) -> list[NestedKey]:
-    """``in_keys`` in the order of the inputs of a network, named in ``roles``, that takes them by position."""
+    """Sorts ``in_keys`` into the order ``roles`` in which a network takes its inputs."""
     arranged = arrange(owner, in_keys, dict.fromkeys(roles, ()))
     return [in_keys[arranged.index(role)] for role in roles]
 
@@ -106,7 +107,7 @@ def _contradiction(owner: str, in_keys: Sequence[NestedKey], names: Names) -> Va
 
 
 def _claims(key: tuple[str, ...], names: Names) -> list[str]:
-    """Inputs that the strongest rule which finds any finds for a key."""
+    """Inputs that match a key by the first rule that matches any."""
     marked = [role for role, mark in _MARKS.items() if role in names and _has(key, mark)]
     if marked:
         return marked
@@ -137,10 +138,10 @@ def _parts(key: NestedKey) -> tuple[str, ...]:
 
 
 def require_tensordict(owner: str, value: object) -> None:
-    """Refuses what is no tensordict, at the door of a module.
+    """Checks that a module got a tensordict.
 
     Raises:
-        TypeError: a dict, or anything else.
+        TypeError: anything else, such as a dict.
     """
     if not is_tensor_collection(value):
         raise TypeError(
@@ -150,10 +151,10 @@ def require_tensordict(owner: str, value: object) -> None:
 
 
 def require_module(owner: str, value: object) -> None:
-    """Refuses what does not say which entries it reads and writes, at the door of a loss, a model or a cost.
+    """Checks that a network is a TensorDictModule.
 
     Raises:
-        TypeError: a plain ``nn.Module``, or anything else.
+        TypeError: anything else, such as a plain ``nn.Module``.
     """
     if not (callable(value) and hasattr(value, "in_keys") and hasattr(value, "out_keys")):
         raise TypeError(
@@ -162,17 +163,28 @@ def require_module(owner: str, value: object) -> None:
         )
 
 
-def choose_output(module: TensorDictModuleBase, key: NestedKey) -> NestedKey | None:
-    """The entry ``key`` among what a module writes, or its only one, whatever that is called; None where there is none."""
+def choose_output(module: TensorDictModuleBase, *keys: NestedKey) -> NestedKey | None:
+    """Which of a module's ``out_keys`` is meant: its only one, or that of the first of ``keys`` it writes; None if none is."""
     if len(module.out_keys) == 1:
         return module.out_keys[0]
-    key = _parts(key)
     written = {_parts(name): name for name in module.out_keys}
-    ends = [name for parts, name in written.items() if parts[-1] == key[-1]]
-    return written.get(key, ends[0] if len(ends) == 1 else None)
+    for key in map(_parts, keys):
+        ends = [name for parts, name in written.items() if parts[-1] == key[-1]]
+        if key in written or len(ends) == 1:
+            return written.get(key, ends[0])
+    return None
 
 
-def read_output(module: TensorDictModuleBase, written: TensorDictBase, key: NestedKey, default: int) -> torch.Tensor:
-    """The entry of :func:`choose_output`, or the one at the position ``default`` of ``out_keys``."""
-    chosen = choose_output(module, key)
-    return written.get(module.out_keys[default] if chosen is None else chosen)
+def read_output(module: TensorDictModuleBase, written: TensorDictBase, *keys: NestedKey) -> torch.Tensor:
+    """Reads the entry of :func:`choose_output`.
+
+    Raises:
+        KeyError: the module wrote several, and none has one of these names.
+    """
+    chosen = choose_output(module, *keys)
+    if chosen is None:
+        raise KeyError(
+            f"no {keys[0]!r} among {module.out_keys}, what the network writes: see set_keys(...), or select the right one "
+            "with selected_out_keys of a TensorDictSequential."
+        )
+    return written.get(chosen)

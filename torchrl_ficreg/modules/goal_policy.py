@@ -1,4 +1,4 @@
-"""A goal-conditioned policy on frozen latents: which action block leads towards that goal?"""
+"""A goal-conditioned policy on frozen latents, and how it is saved and loaded."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from torchrl_ficreg._safe_files import (
 )
 from torchrl_ficreg.keys import ACTION, GOAL_LATENT, LATENT
 from torchrl_ficreg.modules.feed import sort_keys
+from torchrl_ficreg.modules.layers import keep_arguments
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 
@@ -34,22 +35,26 @@ _SMALLEST_STD = 1e-6  # below it a latent dimension counts as constant
 class GoalNetwork(nn.Module):
     """Hidden layers with LayerNorm on a standardised latent and goal latent.
 
-    No BatchNorm: an imagined latent is answered as a real one is, alone or in company.
+    Without BatchNorm: the output for a latent does not depend on the rest of the batch.
 
     Args:
-        latent_dim: D.
-        action_dim: width F * A of an action block.
-        hidden_dim: of each hidden layer.
-        depth: hidden layers.
+        latent_dim (int): D.
+        action_dim (int): F * A, width of an action block.
+        hidden_dim (int, optional): width of each hidden layer. Default: ``512``.
+        depth (int, optional): number of hidden layers. Default: ``3``.
+
+    Raises:
+        ValueError: a size that is not positive.
     """
 
+    @keep_arguments
     def __init__(self, latent_dim: int, action_dim: int, hidden_dim: int = 512, depth: int = 3) -> None:
         super().__init__()
         sizes = {"latent_dim": latent_dim, "action_dim": action_dim, "hidden_dim": hidden_dim, "depth": depth}
         small = [f"{name}={size}" for name, size in sizes.items() if size < 1]
         if small:
             raise ValueError(f"sizes of a goal policy must be positive, got {', '.join(small)}.")
-        self.latent_dim, self.action_dim, self.hidden_dim, self.depth = latent_dim, action_dim, hidden_dim, depth
+        self.latent_dim, self.action_dim = latent_dim, action_dim
         self.register_buffer("latent_mean", torch.zeros(latent_dim))
         self.register_buffer("latent_std", torch.ones(latent_dim))
         layers: list[nn.Module] = []
@@ -66,21 +71,17 @@ class GoalNetwork(nn.Module):
         if latent.shape != goal.shape or latent.shape[-1] != self.latent_dim:
             raise ValueError(
                 f"the policy reads latents and goal latents [..., {self.latent_dim}] of one shape, got "
-                f"{list(latent.shape)} and {list(goal.shape)}: was it trained for another world model?"
+                f"{list(latent.shape)} and {list(goal.shape)}: use the world model that it was trained with."
             )
         both = torch.stack([latent, goal], dim=-2)  # [..., 2, D]
         return self.layers(((both - self.latent_mean) / self.latent_std).flatten(-2))
 
-    @property
-    def sizes(self) -> dict[str, int]:
-        """The arguments that build the same network."""
-        return {name: getattr(self, name) for name in ("latent_dim", "action_dim", "hidden_dim", "depth")}
-
     @torch.no_grad()
     def standardize_by(self, latent: torch.Tensor) -> None:
-        """Takes mean and standard deviation of its input from training latents [N, D].
+        """Sets mean and standard deviation of the input to those of training latents; constant dimensions are only centred.
 
-        A dimension that never changes is only centred.
+        Args:
+            latent (Tensor): [N, D].
 
         Raises:
             ValueError: another width, fewer than two latents, or one that is not finite.
@@ -88,8 +89,8 @@ class GoalNetwork(nn.Module):
         if latent.ndim != 2 or len(latent) < 2 or latent.shape[1] != self.latent_dim:
             raise ValueError(f"expected at least 2 latents [N, {self.latent_dim}], got {list(latent.shape)}.")
         rows = latent if latent.dtype in (torch.float32, torch.float64) else latent.float()
-        rows = rows.cpu().numpy().astype(np.float64)  # summed in float64 by NumPy: MPS has none
-        with np.errstate(invalid="ignore"):  # told below
+        rows = rows.cpu().numpy().astype(np.float64)  # NumPy sums in float64, which MPS has not
+        with np.errstate(invalid="ignore"):  # checked below
             mean, std = rows.mean(0), rows.std(0)  # [D], [D]
         if not np.isfinite([mean, std]).all():
             raise ValueError("the training latents hold a NaN or an infinity: leave those rows out.")
@@ -107,15 +108,19 @@ Bounds = tuple[torch.Tensor, torch.Tensor]
 class GoalPolicy(TensorDictModule):
     """``latent`` and ``goal_latent`` [..., D] -> ``action`` [..., F * A], one z-scored action block.
 
-    A plain deterministic regressor: trained on the rows of :class:`~torchrl_ficreg.data.latents.GoalRows`, it answers
-    with the mean of what the recorded agent did on its way from one latent to the other, however far that was
-    (arXiv 2605.08732 trains one that is told the distance too). Alone it is a policy without planning; imagined
-    forward by a world model, see :meth:`imagine`, it proposes whole plans to a search.
+    A deterministic regressor. Trained on the rows of :class:`~torchrl_ficreg.data.latents.GoalRows`, it predicts the mean
+    of the blocks that the recorded agent executed on its way from one latent to the other, whatever their distance
+    (arXiv 2605.08732 also conditions on the distance). It is a policy without planning; rolled out in a world model, see
+    :meth:`rollout`, it proposes whole plans to a planner.
 
     Args:
-        latent_dim, action_dim, hidden_dim, depth: see :class:`~torchrl_ficreg.modules.goal_policy.GoalNetwork`.
-        in_keys, out_key: where the latent and the goal latent are read, told apart by name where they can be, and the action
-            block is written.
+        latent_dim (int): D.
+        action_dim (int): F * A, width of an action block.
+        hidden_dim (int, optional): width of each hidden layer. Default: ``512``.
+        depth (int, optional): number of hidden layers. Default: ``3``.
+        in_keys (tuple of NestedKey, optional): where the latent and the goal latent are read. Their order matters only
+            where their names do not say which is which. Default: ``("latent", "goal_latent")``.
+        out_key (NestedKey, optional): where the action block is written. Default: ``"action"``.
 
     Raises:
         ValueError: a size that is not positive.
@@ -143,11 +148,14 @@ class GoalPolicy(TensorDictModule):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """The arguments that build the same network."""
-        return self.module.sizes
+        """The arguments that build the same policy: ``latent_dim``, ``action_dim``, ``hidden_dim`` and ``depth``."""
+        return dict(self.module.arguments)
 
     def standardize_by(self, latent: torch.Tensor) -> None:
-        """Takes mean and standard deviation of its input from training latents [N, D].
+        """Sets mean and standard deviation of the input to those of training latents.
+
+        Args:
+            latent (Tensor): [N, D].
 
         Raises:
             ValueError: another width, fewer than two latents, or one that is not finite.
@@ -155,19 +163,19 @@ class GoalPolicy(TensorDictModule):
         self.module.standardize_by(latent)
 
     def check_fits(self, world_model: LatentWorldModel) -> None:
-        """Refuses a world model with other latents or action blocks.
+        """Checks that a world model has latents and action blocks of the policy's widths.
 
         Raises:
-            ValueError: their widths differ.
+            ValueError: a width differs.
         """
         ours, theirs = self.module, world_model
         if (ours.latent_dim, ours.action_dim) != (theirs.latent_dim, theirs.block_dim):
             raise ValueError(
                 f"the policy has latents of {ours.latent_dim} and action blocks of {ours.action_dim}, the world model "
-                f"{theirs.latent_dim} and {theirs.block_dim}: train a policy for this model with train_policy.py."
+                f"{theirs.latent_dim} and {theirs.block_dim}: train a policy for this model."
             )
 
-    def imagine(
+    def rollout(
         self,
         world_model: LatentWorldModel,
         latent: torch.Tensor,
@@ -177,24 +185,25 @@ class GoalPolicy(TensorDictModule):
         *,
         bounds: Bounds | None = None,
     ) -> torch.Tensor:
-        """The plan that the policy would follow if the world went on as the model predicts.
+        """The plan that the policy follows in the world model.
 
-        Block by block: the policy answers the newest latent, and the world model predicts the next one from the last H
-        latents, as :meth:`~torchrl_ficreg.LatentWorldModel.rollout` does on the finished plan.
+        Block by block, the policy chooses an action block for the newest latent and the world model predicts the next
+        latent from the last H, as :meth:`~torchrl_ficreg.LatentWorldModel.rollout` does for the finished plan.
 
         Args:
-            world_model: the dynamics, in eval mode.
-            latent: context [..., C, D], oldest first.
-            past_action: z-scored blocks [..., C - 1, F * A] executed between the context frames.
-            goal: [..., D].
-            horizon: N, blocks to imagine.
-            bounds: (low [F * A], high [F * A]), z-scored, between which every block is put before it is imagined.
+            world_model (LatentWorldModel): the dynamics, in eval mode.
+            latent (Tensor): context [..., C, D], oldest first.
+            past_action (Tensor): z-scored blocks [..., C - 1, F * A] executed between the context frames.
+            goal (Tensor): [..., D].
+            horizon (int): N, number of blocks.
+            bounds (tuple of Tensor, optional): (low [F * A], high [F * A]), z-scored, to which every block is clamped.
+                Default: None.
 
         Returns:
             the plan [..., N, F * A], z-scored, in the dtype of ``latent``.
 
         Raises:
-            ValueError: other shapes, no block to imagine, or a world model of other widths.
+            ValueError: other shapes, a horizon below 1, or a world model of other widths.
 
         Examples:
             >>> import torch
@@ -202,14 +211,15 @@ class GoalPolicy(TensorDictModule):
             >>> model, _ = make_world_model(ModelConfig.preset("cpu"), action_dim=2)
             >>> policy, start, goal = GoalPolicy(16, 10), torch.randn(4, 1, 16), torch.randn(4, 16)
             >>> with torch.inference_mode():
-            ...     plan = policy.imagine(model.eval(), start, torch.zeros(4, 0, 10), goal, horizon=5)
+            ...     plan = policy.rollout(model.eval(), start, torch.zeros(4, 0, 10), goal, horizon=5)
             >>> plan.shape
             torch.Size([4, 5, 10])
         """
         self.check_fits(world_model)
         self._check_context(latent, past_action, goal, horizon, bounds)
         # Planners may keep the predictor in another precision.
-        history, dtype = world_model.history, next(world_model.predictor.parameters(), latent).dtype
+        predictor = getattr(world_model, "predictor", world_model)
+        history, dtype = world_model.history, next(predictor.parameters(), latent).dtype
         own = next(self.module.parameters()).dtype
         seen, done = latent[..., -history:, :], past_action[..., max(0, past_action.shape[-2] - history + 1) :, :]
         plan: list[torch.Tensor] = []
@@ -220,7 +230,7 @@ class GoalPolicy(TensorDictModule):
             if len(plan) == horizon:
                 return torch.stack(plan, dim=-2)
             done = torch.cat([done, block.unsqueeze(-2)], dim=-2)[..., -history:, :]  # as many as seen
-            following = world_model.predict(seen.to(dtype), done.to(dtype))[..., -1:, :]
+            following = world_model.rollout(seen.to(dtype), done.to(dtype))  # [..., 1, D]
             seen = torch.cat([seen, following.to(latent.dtype)], dim=-2)[..., -history:, :]
 
     def _check_context(
@@ -234,7 +244,7 @@ class GoalPolicy(TensorDictModule):
             or past_action.shape != (*latent.shape[:-2], latent.shape[-2] - 1, self.module.action_dim)
         ):
             raise ValueError(
-                f"imagine takes latents [..., C, {self.module.latent_dim}], the C - 1 past blocks "
+                f"rollout takes latents [..., C, {self.module.latent_dim}], the C - 1 past blocks "
                 f"[..., C - 1, {self.module.action_dim}], goals [..., {self.module.latent_dim}] and a horizon >= 1, got "
                 f"{list(latent.shape)}, {list(past_action.shape)}, {list(goal.shape)} and {horizon}."
             )
@@ -246,13 +256,13 @@ class GoalPolicy(TensorDictModule):
 def save_goal_policy(policy: GoalPolicy, folder: Path | str, world_model: LatentWorldModel) -> Path:
     """Writes ``policy.safetensors`` and ``policy.json``, readable without running anything that is in them.
 
-    What the policy depends on is noted with it: the encoder's weights and the action statistics, as a checksum. Weights
-    are written in float32. Keys of the module are not kept: a loaded policy reads and writes the standard ones.
+    A checksum of the encoder's weights and the action statistics, on which the policy depends, is saved with it. Weights
+    are written in float32. Keys are not saved: a loaded policy reads and writes the default ones.
 
     Args:
-        policy: to save.
-        folder: made if missing; a policy already there is replaced.
-        world_model: whose latents it was trained on.
+        policy (GoalPolicy): the policy.
+        folder (str or Path): created if missing; a policy already there is replaced.
+        world_model (LatentWorldModel): the model on whose latents it was trained.
 
     Returns:
         the folder.
@@ -286,9 +296,9 @@ def load_goal_policy(
     """Reads what :func:`save_goal_policy` wrote, for the world model it was trained with.
 
     Args:
-        folder: with ``policy.json`` and ``policy.safetensors``.
-        world_model: whose latents the policy will read.
-        device: where the policy goes.
+        folder (str or Path): with ``policy.json`` and ``policy.safetensors``.
+        world_model (LatentWorldModel): the model whose latents the policy reads.
+        device (torch.device or str, optional): device of the policy. Default: ``"cpu"``.
 
     Returns:
         the policy, in eval mode.
@@ -304,7 +314,7 @@ def load_goal_policy(
     weights, config = folder / WEIGHTS_FILE, config_file(folder / WEIGHTS_FILE, folder / CONFIG_FILE)
     for file in (config, weights):
         if not file.exists():
-            raise FileNotFoundError(f"no {file.name} in {folder}: train a policy with train_policy.py checkpoint=...")
+            raise FileNotFoundError(f"no {file.name} in {folder}: give a folder that save_goal_policy or train_policy.py wrote.")
     content = read_config(config, FORMAT, VERSION, instead="give a folder that save_goal_policy wrote.")
     shapes = read_shapes(weights)
     try:
@@ -313,7 +323,7 @@ def load_goal_policy(
         with torch.device("meta"):
             wanted = GoalPolicy(**sizes).module.state_dict()
         check_shapes(wanted, shapes)
-    # A missing field, a foreign one, tensors of another network.
+    # A missing or unknown field, or tensors of another network.
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:160]
         raise ValueError(
@@ -327,11 +337,11 @@ def load_goal_policy(
     if checksum != _checksum(world_model):
         raise ValueError(
             f"{folder} holds a policy that was trained on another encoder or other action statistics: train one for "
-            "this model with train_policy.py, overwrite=true."
+            "this model (with train_policy.py: overwrite=true)."
         )
     return policy.to(device).eval()
 
 
 def _checksum(world_model: LatentWorldModel) -> str:
-    """Changes with any weight of the encoder and with the action statistics: all that a policy's numbers refer to."""
+    """Checksum of the encoder's weights and the action statistics."""
     return checksum_of({**world_model.encoder.state_dict(), **dict(world_model.named_buffers(recurse=False))})

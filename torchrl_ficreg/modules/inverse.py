@@ -1,12 +1,14 @@
-"""Inverse dynamics models: which action led from one latent to the next, and how sure can one be?
+"""Inverse dynamics models: they recover the action block that led from one latent to the next.
 
-One interface. All read ``latent`` and ``("next", "latent")`` [..., T, D] and write ``recovered_action``
-[..., T, F * A], z-scored. Some say how sure they are, per dimension: a Gaussian head writes
-``recovered_action_log_var``, an ensemble writes ``recovered_action_spread``, the variance among its members. None
-holds a BatchNorm: the same network judges imagined transitions, and running statistics would be moved by them.
+All read ``latent`` and ``("next", "latent")`` [..., T, D] and write ``recovered_action`` [..., T, F * A], z-scored. Two
+also write an uncertainty of every dimension: a Gaussian head ``recovered_action_log_var``, an ensemble
+``recovered_action_variance``, the variance among its members. None contains a BatchNorm: the losses also apply them to
+predicted transitions, which would change its running statistics.
 """
 
 from __future__ import annotations
+
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -14,11 +16,17 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_ficreg.keys import LATENT, RECOVERED_ACTION
-from torchrl_ficreg.modules.feed import NEXT_LATENT, sort_keys
+from torchrl_ficreg.keys import (
+    LATENT,
+    NEXT_LATENT,
+    RECOVERED_ACTION,
+    RECOVERED_ACTION_LOG_VAR,
+    RECOVERED_ACTION_VARIANCE,
+)
+from torchrl_ficreg.modules.feed import sort_keys
+from torchrl_ficreg.modules.layers import keep_arguments
 from torchrl_ficreg.modules.transformer import Block
 
-LOG_VAR, SPREAD = "recovered_action_log_var", "recovered_action_spread"
 _LOG_VAR_RANGE = (-7.0, 2.0)  # of z-scored actions: from a std of 0.03 to one of 2.7
 
 
@@ -26,11 +34,13 @@ class InverseMLP(nn.Module):
     """Three linear layers on two concatenated latents (FICReg, appendix B).
 
     Args:
-        latent_dim: D.
-        action_dim: width of an action block, frame skip x raw action dimension.
-        hidden_dim, dropout: of the two hidden layers.
+        latent_dim (int): D.
+        action_dim (int): F * A, width of an action block.
+        hidden_dim (int, optional): width of the two hidden layers. Default: ``512``.
+        dropout (float, optional): dropout rate of the two hidden layers. Default: ``0.0``.
     """
 
+    @keep_arguments
     def __init__(self, latent_dim: int, action_dim: int, hidden_dim: int = 512, dropout: float = 0.0) -> None:
         super().__init__()
         self.layers = nn.Sequential(
@@ -51,25 +61,30 @@ class InverseMLP(nn.Module):
 class GaussianInverse(InverseMLP):
     """Mean and log-variance of the action block; arguments as for :class:`InverseMLP`."""
 
+    @keep_arguments
     def __init__(self, latent_dim: int, action_dim: int, hidden_dim: int = 512, dropout: float = 0.0) -> None:
         super().__init__(latent_dim, 2 * action_dim, hidden_dim, dropout)
 
     def forward(self, latent: torch.Tensor, next_latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """[..., D] and [..., D] -> mean and log-variance, each [..., F * A]."""
         mean, log_var = super().forward(latent, next_latent).chunk(2, dim=-1)
-        low, high = _LOG_VAR_RANGE  # softly bounded (arXiv 1805.12114), so that the gradient never dies
+        low, high = _LOG_VAR_RANGE  # soft bounds (arXiv 1805.12114), whose gradient never vanishes
         log_var = high - F.softplus(high - log_var)
         return mean, low + F.softplus(log_var - low)
 
 
 class InverseEnsemble(nn.Module):
-    """Independently started :class:`InverseMLP` members; their mean, and their variance where they disagree.
+    """Independently initialised :class:`InverseMLP` members; writes the mean and the variance of their outputs.
 
     Args:
-        members: at least 2.
-        latent_dim, action_dim, hidden_dim, dropout: of each member.
+        latent_dim (int): D.
+        action_dim (int): F * A, width of an action block.
+        hidden_dim (int, optional): width of the hidden layers of a member. Default: ``512``.
+        dropout (float, optional): dropout rate of a member. Default: ``0.0``.
+        members (int, optional): number of members, at least 2. Default: ``4``.
     """
 
+    @keep_arguments
     def __init__(
         self, latent_dim: int, action_dim: int, hidden_dim: int = 512, dropout: float = 0.0, members: int = 4
     ) -> None:
@@ -86,20 +101,22 @@ class InverseEnsemble(nn.Module):
 
 
 class InverseTransformer(nn.Module):
-    """Sees all latents so far: one frame hides velocity, a few show it.
+    """Recovers an action block from all latents up to it: one frame does not show a velocity, several do.
 
-    A causal transformer reads the latents up to t; its state and the next latent give the action. Only the next latent
-    of step t is taken from the transition to be judged, so an imagined one is seen against real history.
+    A causal transformer reads the latents up to t; a head recovers the action block from its state, the latent and the
+    next latent. Only the next latent of step t enters, so a predicted transition is evaluated after real history.
 
     Args:
-        latent_dim: D.
-        action_dim: width of an action block.
-        hidden_dim: width of the transformer and of the head.
-        dropout: in the head.
-        history: H, longest sequence of latents.
-        depth, heads: of the transformer.
+        latent_dim (int): D.
+        action_dim (int): F * A, width of an action block.
+        hidden_dim (int, optional): width of the transformer and of the head. Default: ``256``.
+        dropout (float, optional): dropout rate of the head. Default: ``0.0``.
+        history (int): H, length of the longest sequence of latents.
+        depth (int, optional): number of blocks. Default: ``2``.
+        heads (int, optional): attention heads of a block. Default: ``4``.
     """
 
+    @keep_arguments
     def __init__(
         self,
         latent_dim: int,
@@ -126,7 +143,7 @@ class InverseTransformer(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Draws the position embedding; the layers reset themselves."""
+        """Draws the position embedding; the layers have their own ``reset_parameters``."""
         nn.init.normal_(self.position, std=0.02)
 
     def forward(self, latent: torch.Tensor, next_latent: torch.Tensor) -> torch.Tensor:
@@ -137,7 +154,7 @@ class InverseTransformer(nn.Module):
         """
         if not 1 <= latent.shape[-2] <= self.history:
             raise ValueError(
-                f"the inverse model sees 1 to {self.history} latents, got {latent.shape[-2]}: give shorter clips, or "
+                f"the inverse model takes 1 to {self.history} latents, got {latent.shape[-2]}: give shorter clips, or "
                 f"build it with history={latent.shape[-2]}."
             )
         tokens = self.to_width(latent.reshape(-1, *latent.shape[-2:])) + self.position[:, : latent.shape[-2]]
@@ -151,15 +168,17 @@ class InverseDynamicsModel(TensorDictModule):
     """``latent`` and ``("next", "latent")`` [..., D] -> ``recovered_action`` [..., F * A], z-scored.
 
     Args:
-        latent_dim: D.
-        action_dim: width F * A of an action block.
-        hidden_dim, dropout: see :class:`InverseMLP`.
-        kind: ``"mlp"``, the paper's; ``"gaussian"``, which also writes ``recovered_action_log_var``; ``"ensemble"``,
-            which also writes ``recovered_action_spread``; or ``"transformer"``, which sees up to ``history`` latents
-            and needs sequences [..., T, D].
-        in_keys, out_key: where the two latents are read, told apart by name where they can be, and the action block is
-            written.
-        **network: further arguments of the network of that kind (``members``; ``history``, ``depth``, ``heads``).
+        latent_dim (int): D.
+        action_dim (int): F * A, width of an action block.
+        hidden_dim (int, optional): width of the hidden layers. Default: ``512``.
+        dropout (float, optional): dropout rate of the hidden layers. Default: ``0.0``.
+        kind (str, optional): ``"mlp"``, the paper's; ``"gaussian"``, which also writes ``recovered_action_log_var``;
+            ``"ensemble"``, which also writes ``recovered_action_variance``; or ``"transformer"``, which takes sequences
+            [..., T, D] of up to ``history`` latents. Default: ``"mlp"``.
+        in_keys (tuple of NestedKey, optional): where the two latents are read. Their order matters only where their
+            names do not say which is which. Default: ``("latent", ("next", "latent"))``.
+        out_key (NestedKey, optional): where the action block is written. Default: ``"recovered_action"``.
+        **network: further arguments of the network of that kind: ``members``, or ``history``, ``depth`` and ``heads``.
 
     Raises:
         ValueError: an unknown kind.
@@ -180,7 +199,7 @@ class InverseDynamicsModel(TensorDictModule):
         hidden_dim: int = 512,
         dropout: float = 0.0,
         *,
-        kind: str = "mlp",
+        kind: Literal["mlp", "gaussian", "ensemble", "transformer"] = "mlp",
         in_keys: tuple[NestedKey, NestedKey] = (LATENT, ("next", LATENT)),
         out_key: NestedKey = RECOVERED_ACTION,
         **network,
@@ -195,7 +214,7 @@ class InverseDynamicsModel(TensorDictModule):
 
 INVERSE_NETWORKS = {
     "mlp": (InverseMLP, ()),
-    "gaussian": (GaussianInverse, (LOG_VAR,)),
-    "ensemble": (InverseEnsemble, (SPREAD,)),
+    "gaussian": (GaussianInverse, (RECOVERED_ACTION_LOG_VAR,)),
+    "ensemble": (InverseEnsemble, (RECOVERED_ACTION_VARIANCE,)),
     "transformer": (InverseTransformer, ()),
 }

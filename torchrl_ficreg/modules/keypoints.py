@@ -1,4 +1,4 @@
-"""Encoder that looks for things and says where they are."""
+"""Keypoint encoder for small frames: spatial soft-argmax over learned feature maps (arXiv 1504.00702)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,22 @@ from torch import nn
 
 from torchrl_ficreg._device import convolution_region, without_autocast
 from torchrl_ficreg.keys import LATENT, PIXELS
-from torchrl_ficreg.modules.layers import channels_last, GlobalBatchNorm1d, PixelNormalizer, restore_lead
+from torchrl_ficreg.modules.layers import (
+    channels_last,
+    GlobalBatchNorm1d,
+    keep_arguments,
+    PixelNormalizer,
+    unflatten_batch,
+)
 
 _STRIDE = 4  # pixels between neighbouring places of a map
 
 
 def spatial_softmax(maps: torch.Tensor) -> torch.Tensor:
-    """The expected place of each map's softmax (arXiv 1504.00702), in at least float32.
+    """Expected position under the softmax of each feature map (arXiv 1504.00702), in at least float32.
 
     Args:
-        maps: [N, K, H, W].
+        maps (Tensor): [N, K, H, W].
 
     Returns:
         [N, 2 K] in [-1, 1]: x of all maps, then y; -1 is left and top.
@@ -39,21 +45,23 @@ def spatial_softmax(maps: torch.Tensor) -> torch.Tensor:
 
 
 class KeypointNetwork(nn.Module):
-    """Convolutions at a quarter of the frame's resolution, the place of each map, and a linear layer on the places.
+    """Convolutions at a quarter of the frame's resolution, the position of each map, and a linear layer on the positions.
 
-    What a latent can hold is where things are, and smooth functions of it; it cannot be filled with ever finer
-    functions of the one thing that is easiest to predict.
+    A latent is a linear function of positions in the frame. This keeps the encoder from filling the latent with ever
+    finer functions of the one quantity that is easiest to predict.
 
     Args:
-        image_size: H = W of the frames, a multiple of 4.
-        channels: of the three convolutions before the maps.
-        num_keypoints: K, maps.
-        latent_dim: D.
+        image_size (int, optional): H = W of the frames, a multiple of 4. Default: ``64``.
+        channels (tuple of int, optional): output channels of the three convolutions before the maps. Default:
+            ``(32, 64, 64)``.
+        num_keypoints (int, optional): K, number of maps. Default: ``32``.
+        latent_dim (int, optional): D. Default: ``16``.
 
     Raises:
         ValueError: an image size that is no multiple of 4, or other than three channels.
     """
 
+    @keep_arguments
     def __init__(
         self,
         *,
@@ -69,7 +77,7 @@ class KeypointNetwork(nn.Module):
             raise ValueError(f"a keypoint encoder has three convolutions before its maps, got channels {channels}.")
         first, second, third = channels
         self.normalize = PixelNormalizer(image_size)
-        # Channels last is the layout that CPU kernels for bfloat16 want.
+        # Channels last: the layout of bfloat16 convolutions on CPUs.
         self.convolutions = nn.Sequential(
             nn.Conv2d(3, first, kernel_size=4, stride=2, padding=1),
             nn.GELU(),
@@ -87,18 +95,19 @@ class KeypointNetwork(nn.Module):
         frames = channels_last(self.normalize(pixels))  # [N, 3, H, W]
         with convolution_region(frames.device):
             maps = self.convolutions(frames)  # [N, K, H / 4, W / 4]
-        # Places are known to a fraction of a pixel, which bfloat16 would round away.
+        # Positions are precise to a fraction of a pixel, which bfloat16 would round away.
         with without_autocast(pixels.device):
             places = self.norm(spatial_softmax(maps).to(self.layer_out.weight.dtype))  # [N, 2 K]
-            return restore_lead(self.layer_out(places), pixels)
+            return unflatten_batch(self.layer_out(places), pixels)
 
 
 class KeypointEncoder(TensorDictModule):
-    """Encoder for small frames with several moving things: ``pixels`` [..., 3, H, W] -> ``latent`` [..., D].
+    """Encoder for small frames with several moving objects: ``pixels`` [..., 3, H, W] -> ``latent`` [..., D].
 
     Args:
-        in_key, out_key: where frames are read and latents are written.
-        **network: see :class:`KeypointNetwork`.
+        in_key (NestedKey, optional): where frames are read. Default: ``"pixels"``.
+        out_key (NestedKey, optional): where latents are written. Default: ``"latent"``.
+        **network: arguments of :class:`KeypointNetwork`.
 
     Raises:
         TypeError, ValueError: see :class:`~torchrl_ficreg.modules.layers.PixelNormalizer`.

@@ -1,7 +1,6 @@
-"""The only attention and adaptive-normalisation blocks of the package.
+"""Transformer blocks: attention, the pre-norm block of encoders, the AdaLN-zero block of the predictor.
 
-``Block`` is the pre-norm block of a vision transformer; ``AdaptiveBlock`` is the same with shift, scale and gate
-given from outside (AdaLN-zero), as the predictor needs it. Shapes: N rows, T tokens, C channels.
+Also activation checkpointing of these blocks. Shapes: N sequences, T tokens, C channels.
 """
 
 from __future__ import annotations
@@ -12,39 +11,43 @@ from torch import nn
 from torch.func import functional_call
 from torch.utils.checkpoint import checkpoint
 
-from torchrl_ficreg.modules.kernels import linear, Linear, packed_attention, suits_packed_attention
-
-
 Cache = tuple[torch.Tensor, torch.Tensor]  # keys and values, each [N, heads, T, dim_head]
 
-
-FEW = 4  # tokens up to which attention costs less by elementwise products than by matrix products, on CPUs
+_MAX_ELEMENTWISE_TOKENS = 4  # up to this many, attention on CPUs is faster without matrix products
 
 
 def attend(
     query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: bool, dropout: float = 0.0
 ) -> torch.Tensor:
-    """Softmax attention by the kernel that is fastest on the device at hand.
+    """Softmax attention: ``scaled_dot_product_attention``, except where CPUs have a faster way.
 
-    The fused kernel wins on GPUs, and on CPUs in float32 where no gradient is wanted. In training on CPUs, and in
-    bfloat16, it costs up to three times two plain matrix products around a softmax; the windows of a few tokens that
-    a planner imagines by the thousand are cheaper still without any matrix product.
+    In bfloat16, two matrix products around a softmax take about three quarters of the time of torch's fused CPU kernel
+    in training. The windows of a few tokens that a planner predicts by the thousand are faster still without any
+    matrix product.
 
     Args:
         query: [N, heads, Q, dim_head], any floating dtype.
-        key, value: [N, heads, T, dim_head].
-        causal: a token sees itself and earlier ones only; Q = T then.
-        dropout: share of the attention weights dropped; 0 outside of training.
+        key: [N, heads, T, dim_head].
+        value: [N, heads, T, dim_head].
+        causal: each token attends to itself and earlier tokens only; requires Q = T.
+        dropout: probability of dropping an attention weight; 0 outside of training. Default: ``0.0``.
 
     Returns:
         [N, heads, Q, dim_head].
     """
-    infers = not dropout and not (torch.is_grad_enabled() and query.requires_grad)
-    on_cpu = query.device.type == "cpu"
-    if on_cpu and infers and key.shape[-2] <= FEW:
-        return _attend_to_few(query, key, value, causal)
-    if not on_cpu or (infers and query.dtype == torch.float32):
-        return F.scaled_dot_product_attention(query, key, value, is_causal=causal, dropout_p=dropout)
+    if query.device.type == "cpu":
+        infers = not dropout and not (torch.is_grad_enabled() and query.requires_grad)
+        if infers and key.shape[-2] <= _MAX_ELEMENTWISE_TOKENS:
+            return _attend_to_few(query, key, value, causal)
+        if query.dtype == torch.bfloat16:
+            return attend_by_products(query, key, value, causal, dropout)
+    return F.scaled_dot_product_attention(query, key, value, is_causal=causal, dropout_p=dropout)
+
+
+def attend_by_products(
+    query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: bool, dropout: float = 0.0
+) -> torch.Tensor:
+    """As :func:`attend`, by its formula: softmax(query key^T / sqrt(dim_head)) value."""
     scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)  # [N, heads, Q, T]
     if causal:
         tokens = scores.shape[-1]
@@ -55,7 +58,7 @@ def attend(
 
 
 def _attend_to_few(query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, causal: bool) -> torch.Tensor:
-    """As :func:`attend`, token by token: matrix products of a few rows spend their time on copies."""
+    """As :func:`attend`, token by token: matrix products of a few rows spend most of their time on copies."""
     keys, values, mixed = key.unbind(2), value.unbind(2), []  # each [N, heads, dim_head]
     for place, token in enumerate(query.unbind(2)):
         seen = place + 1 if causal else len(keys)
@@ -68,19 +71,20 @@ def _attend_to_few(query: torch.Tensor, key: torch.Tensor, value: torch.Tensor, 
         for i in range(1, seen):
             mix = torch.addcmul(mix, weights[i], values[i])
         mixed.append(mix)
-    return torch.stack(mixed, dim=1).transpose(1, 2)  # in memory [N, Q, heads, dim_head], as the next layer reads it
+    return torch.stack(mixed, dim=1).transpose(1, 2)  # [N, Q, heads, dim_head] in memory, the layout of the next layer
 
 
 class Attention(nn.Module):
     """Multi-head self-attention.
 
     Args:
-        dim: channels C of the tokens.
-        heads, dim_head: number and width of the heads.
-        causal: a token sees itself and earlier ones only.
-        qkv_bias: bias of the query, key and value projection.
-        dropout: after the output projection.
-        weight_dropout: of the attention weights.
+        dim (int): C, channels of the tokens.
+        heads (int): number of heads.
+        dim_head (int): width of a head.
+        causal (bool): each token attends to itself and earlier tokens only.
+        qkv_bias (bool): whether the query, key and value projection has a bias.
+        dropout (float, optional): dropout rate after the output projection. Default: ``0.0``.
+        weight_dropout (float, optional): dropout rate of the attention weights. Default: ``0.0``.
     """
 
     def __init__(
@@ -97,43 +101,44 @@ class Attention(nn.Module):
         super().__init__()
         self.heads, self.causal, self.weight_dropout = heads, causal, weight_dropout
         self.inner = heads * dim_head
-        self.to_qkv = Linear(dim, 3 * self.inner, bias=qkv_bias)
-        self.to_out = Linear(self.inner, dim)
+        self.to_qkv = nn.Linear(dim, 3 * self.inner, bias=qkv_bias)
+        self.to_out = nn.Linear(self.inner, dim)
         self.dropout = nn.Dropout(dropout)
+
+    def extra_repr(self) -> str:
+        """Settings that no sub-module shows."""
+        return f"heads={self.heads}, causal={self.causal}, weight_dropout={self.weight_dropout}"
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """[N, T, C] -> [N, T, C]."""
         drop = self.weight_dropout if self.training else 0.0
         if x.shape[-2] == 1 and not drop:
-            # One token attends to itself alone: the softmax is 1 whatever query and key are.
+            # A single token attends to itself only: its weight is 1 whatever query and key are.
             bias = self.to_qkv.bias[2 * self.inner :] if self.to_qkv.bias is not None else None
             mixed = F.linear(x, self.to_qkv.weight[2 * self.inner :], bias)  # [N, 1, inner]
         else:
-            packed = self.to_qkv(x)  # [N, T, 3 * inner]
-            if suits_packed_attention(packed) and not self.causal and not drop:
-                mixed = packed_attention(packed, self.heads)
-            else:
-                mixed = attend(*self._heads(packed, 3).unbind(0), self.causal, drop).transpose(1, 2).flatten(2)
+            query, key, value = self._heads(self.to_qkv(x), 3).unbind(0)
+            mixed = attend(query, key, value, self.causal, drop).transpose(1, 2).flatten(2)
         return self.dropout(self.to_out(mixed))  # of [N, T, inner]
 
     def first(self, x: torch.Tensor) -> torch.Tensor:
-        """The first token of :meth:`forward` alone, where it sees all others: [N, T, C] -> [N, 1, C]."""
+        """Only the first token of :meth:`forward`, without a causal mask: [N, T, C] -> [N, 1, C]."""
         mixed = attend(*self._one_query(x, 0), False).transpose(1, 2).flatten(2)  # [N, 1, inner]
         return self.dropout(self.to_out(mixed))
 
     def extend(
         self, x: torch.Tensor, past: Cache | None, *, last: bool, keep: bool
     ) -> tuple[torch.Tensor, Cache | None]:
-        """Causal attention of new tokens whose predecessors' keys and values are known; no dropout.
+        """Causal attention of new tokens after tokens whose keys and values are cached; no dropout.
 
         Args:
-            x: [N, T, C]; T = 1 if there is a past.
-            past: keys and values of the P earlier tokens, each [N, heads, P, dim_head].
-            last: return the last token alone, at the cost of one token.
-            keep: return the keys and values for a next call.
+            x (Tensor): [N, T, C]; T = 1 with a past.
+            past (tuple of Tensor, optional): keys and values of the P earlier tokens, each [N, heads, P, dim_head].
+            last (bool): compute and return only the last token.
+            keep (bool): also return the keys and values, for a next call.
 
         Returns:
-            [N, T, C], or [N, 1, C] if ``last``, and the keys and values of all P + T tokens, or None.
+            [N, T, C], or [N, 1, C] with ``last``, and the keys and values of all P + T tokens with ``keep``, else None.
         """
         if past is None and not keep and x.shape[-2] == 1:
             return self.forward(x), None
@@ -151,9 +156,9 @@ class Attention(nn.Module):
         """The query of one token [N, heads, 1, dim_head], and keys and values of all T."""
         weight, bias = self.to_qkv.weight, self.to_qkv.bias
         split = (None, None) if bias is None else (bias[: self.inner], bias[self.inner :])
-        token = x[:, place].contiguous()  # [N, C]; of a strided 3-D input, torch multiplies row by row
+        token = x[:, place].contiguous()  # [N, C]; torch multiplies a strided 3-D input row by row
         query = self._heads(F.linear(token, weight[: self.inner], split[0]).unsqueeze(1), 1)
-        key, value = self._heads(linear(x, weight[self.inner :], split[1]), 2).unbind(0)
+        key, value = self._heads(F.linear(x, weight[self.inner :], split[1]), 2).unbind(0)
         return query[0], key, value
 
     def _heads(self, x: torch.Tensor, parts: int) -> torch.Tensor:
@@ -166,12 +171,20 @@ class FeedForward(nn.Sequential):
 
     def __init__(self, dim: int, hidden: int, dropout: float = 0.0) -> None:
         super().__init__(
-            Linear(dim, hidden), nn.GELU(), nn.Dropout(dropout), Linear(hidden, dim), nn.Dropout(dropout)
+            nn.Linear(dim, hidden), nn.GELU(), nn.Dropout(dropout), nn.Linear(hidden, dim), nn.Dropout(dropout)
         )
 
 
 class Block(nn.Module):
-    """Pre-norm transformer block, [N, T, C] -> [N, T, C]; causal if asked to be."""
+    """Pre-norm transformer block, [N, T, C] -> [N, T, C].
+
+    Args:
+        dim (int): C.
+        heads (int): number of attention heads, each C / heads wide.
+        mlp_dim (int): hidden width of the feed-forward layer.
+        eps (float, optional): of the layer norms. Default: ``1e-12``.
+        causal (bool, optional): each token attends to itself and earlier tokens only. Default: ``False``.
+    """
 
     def __init__(self, dim: int, heads: int, mlp_dim: int, eps: float = 1e-12, *, causal: bool = False) -> None:
         super().__init__()
@@ -182,12 +195,12 @@ class Block(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """[N, T, C] -> [N, T, C]."""
-        # The branches are widened first under autocast: torch adds tensors of two dtypes at half the speed.
+        # Under autocast, branches are cast to float32 first: torch adds tensors of two dtypes at half the speed.
         x = x + self.attn(self.attn_norm(x)).to(x.dtype)
         return x + self.mlp(self.mlp_norm(x)).to(x.dtype)
 
     def first(self, x: torch.Tensor) -> torch.Tensor:
-        """The first token of :meth:`forward` alone, where it sees all others: [N, T, C] -> [N, 1, C]."""
+        """Only the first token of :meth:`forward`, for a block that is not causal: [N, T, C] -> [N, 1, C]."""
         token = x[:, :1] + self.attn.first(self.attn_norm(x))
         return token + self.mlp(self.mlp_norm(token))
 
@@ -195,8 +208,16 @@ class Block(nn.Module):
 class AdaptiveBlock(nn.Module):
     """Causal block whose normalisation is shifted, scaled and gated by a condition (AdaLN-zero, arXiv 2212.09748).
 
-    The modulation layer starts at zero, so the block starts as the identity. It depends on the condition alone:
-    :meth:`modulation` may be computed once and reused while the tokens change, as a planner does.
+    The modulation layer is initialised to zero, so the block starts as the identity. The modulation depends on the
+    condition only: a rollout computes it once and reuses it while the tokens change.
+
+    Args:
+        dim (int): C.
+        heads (int): number of attention heads.
+        dim_head (int): width of a head.
+        mlp_dim (int): hidden width of the feed-forward layer.
+        dropout (float): dropout rate of both branches.
+        weight_dropout (float, optional): dropout rate of the attention weights. Default: ``0.0``.
     """
 
     def __init__(
@@ -214,7 +235,7 @@ class AdaptiveBlock(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Zeroes the modulation; the other layers reset themselves."""
+        """Sets the modulation layer to zero; the other layers have their own ``reset_parameters``."""
         nn.init.zeros_(self.to_modulation.weight)
         nn.init.zeros_(self.to_modulation.bias)
 
@@ -231,7 +252,7 @@ class AdaptiveBlock(nn.Module):
     def extend(
         self, x: torch.Tensor, modulation: torch.Tensor, past: Cache | None, *, last: bool, keep: bool
     ) -> tuple[torch.Tensor, Cache | None]:
-        """As :meth:`forward` without dropout, for new tokens after known ones; see :meth:`Attention.extend`."""
+        """As :meth:`forward` without dropout, for new tokens after cached ones; see :meth:`Attention.extend`."""
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.chunk(6, dim=-1)  # each [N, T, C]
         hidden = self.attn_norm(_modulate(self.adaptive_norm(x), shift_a, scale_a))
         mixed, seen = self.attn.extend(hidden, past, last=last, keep=keep)
@@ -250,16 +271,16 @@ def _modulate(x: torch.Tensor, shift: torch.Tensor, scale: torch.Tensor) -> torc
 def checkpoint_activations(*networks: nn.Module, enabled: bool = True) -> None:
     """Switches activation checkpointing of every transformer inside the networks on or off.
 
-    Between its blocks nothing but their inputs is kept for the backward pass, which computes the rest again: the same
-    gradients to the last bit, dropout included, at the cost of one more forward pass. To be called before a loss is
-    built from the networks.
+    Only the inputs of each block are kept for the backward pass, which recomputes the rest: the gradients are the same
+    to the last bit, dropout included, at the cost of one more forward pass. Call it before a loss is built from the
+    networks.
 
     Args:
-        *networks: an encoder, a predictor, a world model ...
-        enabled: on or off.
+        *networks (nn.Module): an encoder, a predictor or a world model.
+        enabled (bool, optional): on or off. Default: ``True``.
 
     Raises:
-        ValueError: there is no transformer to switch.
+        ValueError: the networks contain no transformer.
 
     Examples:
         >>> from torchrl_ficreg import ViTEncoder
@@ -270,15 +291,15 @@ def checkpoint_activations(*networks: nn.Module, enabled: bool = True) -> None:
     """
     found = [part for network in networks for part in network.modules() if hasattr(part, "checkpointing")]
     if not found:
-        raise ValueError("none of these networks has transformer blocks whose activations could be computed again.")
+        raise ValueError("these networks have no transformer blocks: activation checkpointing needs a transformer.")
     for part in found:
         part.checkpointing = enabled
 
 
-def run_block(block: nn.Module, *inputs: torch.Tensor, again: bool) -> torch.Tensor:
-    """``block(*inputs)``; with ``again``, and where gradients are wanted, its activations are not kept."""
-    if not (again and torch.is_grad_enabled()):
+def run_block(block: nn.Module, *inputs: torch.Tensor, checkpointing: bool) -> torch.Tensor:
+    """``block(*inputs)``; with ``checkpointing``, its activations are recomputed in the backward pass."""
+    if not (checkpointing and torch.is_grad_enabled()):
         return block(*inputs)
-    # By the time of the backward pass a functional loss has taken its parameters out of the module.
+    # At the time of the backward pass, a functional loss has removed its parameters from the module.
     tensors = {**dict(block.named_parameters()), **dict(block.named_buffers())}
     return checkpoint(lambda *x: functional_call(block, tensors, x), *inputs, use_reentrant=False)

@@ -10,8 +10,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 
 from torchrl_ficreg.keys import LATENT, PIXELS
-from torchrl_ficreg.modules.kernels import Linear
-from torchrl_ficreg.modules.layers import PixelNormalizer, Projector, restore_lead
+from torchrl_ficreg.modules.layers import keep_arguments, PixelNormalizer, Projector, unflatten_batch
 from torchrl_ficreg.modules.transformer import Block, run_block
 
 Init = Literal["torch", "published"]
@@ -21,13 +20,18 @@ class VisionTransformer(nn.Module):
     """Class-token vision transformer (arXiv 2010.11929) with a BatchNorm projector on the class token.
 
     Args:
-        image_size, patch_size: H = W of the frames and of one patch, in pixels.
-        width, depth, heads, mlp_dim: of the transformer.
-        projector_dim: hidden width of the projector.
-        latent_dim: D.
-        init: of the linear layers before the projector, the patch projection among them. ``"torch"`` is PyTorch's
-            default; ``"published"`` draws weights from a normal distribution of standard deviation 0.02, truncated at
-            +-2, and sets biases to 0, as the encoder of the published code (transformers' ``ViTModel``) does.
+        image_size (int, optional): H = W of the frames, in pixels. Default: ``224``.
+        patch_size (int, optional): height and width of a patch, in pixels. Default: ``14``.
+        width (int, optional): channels of a token. Default: ``192``.
+        depth (int, optional): number of blocks. Default: ``12``.
+        heads (int, optional): attention heads of a block. Default: ``3``.
+        mlp_dim (int, optional): hidden width of a block's feed-forward layer. Default: ``768``.
+        projector_dim (int, optional): hidden width of the projector. Default: ``2048``.
+        latent_dim (int, optional): D. Default: ``192``.
+        init (str, optional): initialisation of the linear layers before the projector, including the patch projection.
+            ``"torch"`` is PyTorch's default; ``"published"`` draws weights from a normal distribution of standard
+            deviation 0.02, truncated at +-2, and sets biases to 0, as the encoder of the published code (transformers'
+            ``ViTModel``) does. Default: ``"torch"``.
 
     Attributes:
         checkpointing: see :func:`~torchrl_ficreg.modules.transformer.checkpoint_activations`.
@@ -38,6 +42,7 @@ class VisionTransformer(nn.Module):
 
     checkpointing = False
 
+    @keep_arguments
     def __init__(
         self,
         *,
@@ -59,7 +64,7 @@ class VisionTransformer(nn.Module):
         self.patch_size, self.init = patch_size, init
         num_patches = (image_size // patch_size) ** 2
         self.normalize = PixelNormalizer(image_size)
-        self.to_patch = Linear(3 * patch_size**2, width)
+        self.to_patch = nn.Linear(3 * patch_size**2, width)
         self.class_token = nn.Parameter(torch.empty(1, 1, width))
         self.position = nn.Parameter(torch.empty(1, num_patches + 1, width))
         self.blocks = nn.ModuleList(Block(width, heads, mlp_dim) for _ in range(depth))
@@ -72,7 +77,7 @@ class VisionTransformer(nn.Module):
         nn.init.normal_(self.class_token, std=0.02)
         nn.init.normal_(self.position, std=0.02)
         if self.init == "torch":
-            return  # the layers drew their weights when they were built
+            return  # the layers are initialised when they are built
         for layer in (self.to_patch, *self.blocks.modules()):
             if isinstance(layer, nn.Linear):
                 nn.init.trunc_normal_(layer.weight, std=0.02)
@@ -85,20 +90,21 @@ class VisionTransformer(nn.Module):
         tokens = self.to_patch(patches.permute(0, 2, 3, 1, 4, 5).flatten(3).flatten(1, 2))  # [N, P, width]
         tokens = torch.cat([self.class_token.expand(len(tokens), -1, -1), tokens], dim=1) + self.position
         for block in self.blocks[:-1]:
-            tokens = run_block(block, tokens, again=self.checkpointing)  # [N, P + 1, width]
-        token = self.blocks[-1].first(tokens)[:, 0]  # [N, width]; of the last layer nothing else is read
-        return restore_lead(self.projector(self.norm(token)), pixels)
+            tokens = run_block(block, tokens, checkpointing=self.checkpointing)  # [N, P + 1, width]
+        token = self.blocks[-1].first(tokens)[:, 0]  # [N, width]; only the class token is needed
+        return unflatten_batch(self.projector(self.norm(token)), pixels)
 
 
 class ViTEncoder(TensorDictModule):
     """Encoder for large frames: ``pixels`` [..., 3, H, W] -> ``latent`` [..., D].
 
-    The default sizes are the paper's ViT-Tiny/14 at 224 pixels (arXiv 2603.19312): 6.3 M parameters with its projector.
-    The published initialisation is ``init="published"``.
+    The default sizes are the paper's ViT-Tiny/14 at 224 pixels (arXiv 2603.19312), 6.3 M parameters with the projector;
+    ``init="published"`` is its initialisation.
 
     Args:
-        in_key, out_key: where frames are read and latents are written.
-        **network: see :class:`VisionTransformer`.
+        in_key (NestedKey, optional): where frames are read. Default: ``"pixels"``.
+        out_key (NestedKey, optional): where latents are written. Default: ``"latent"``.
+        **network: arguments of :class:`VisionTransformer`.
 
     Raises:
         TypeError, ValueError: see :class:`~torchrl_ficreg.modules.layers.PixelNormalizer`.

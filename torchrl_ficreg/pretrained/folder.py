@@ -1,13 +1,14 @@
-"""Our own format: ``model.safetensors`` and ``config.json``, readable without running anything that is in them."""
+"""The package's own format: ``model.safetensors`` and ``config.json``, read without executing code from them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModule
 from torch import nn
 
 from torchrl_ficreg._safe_files import (
@@ -24,32 +25,42 @@ from torchrl_ficreg._safe_files import (
     save_model,
     state_of,
 )
-from torchrl_ficreg.modules.inverse import InverseDynamicsModel
+from torchrl_ficreg.modules.conv import ConvEncoder, ConvNetwork
+from torchrl_ficreg.modules.inverse import INVERSE_NETWORKS, InverseDynamicsModel
+from torchrl_ficreg.modules.keypoints import KeypointEncoder, KeypointNetwork
+from torchrl_ficreg.modules.predictor import CausalPredictor, CausalTransformer
+from torchrl_ficreg.modules.vit import VisionTransformer, ViTEncoder
 from torchrl_ficreg.modules.world_model import LatentWorldModel
-from torchrl_ficreg.pretrained._sizes import (
-    build_inverse_model,
-    build_world_model,
-    inverse_model_sizes,
-    Sizes,
-    world_model_sizes,
-)
 
 FORMAT, VERSION = "torchrl_ficreg.world_model", 1
 CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
 _MODEL, _INVERSE = "world_model", "inverse_model"
 _BOUNDS = ("action_low", "action_high")
 
+Sizes = dict[str, Any]  # the arguments that build a network, as plain numbers
+# Encoders by kind, and their arguments in the order of config.json, which leaves out how they are initialised.
+_ENCODERS = {"vit": ViTEncoder, "conv": ConvEncoder, "keypoint": KeypointEncoder}
+_ENCODER_ARGUMENTS = {
+    VisionTransformer: (
+        *("vit", "image_size", "projector_dim", "latent_dim"),
+        *("patch_size", "width", "depth", "heads", "mlp_dim"),
+    ),
+    ConvNetwork: ("conv", "image_size", "projector_dim", "latent_dim", "channels"),
+    KeypointNetwork: ("keypoint", "image_size", "channels", "num_keypoints", "latent_dim"),
+}
+
 
 @dataclass(frozen=True)
 class ModelCard:
-    """What one must know about a model to use it without its dataset, as plain JSON values.
+    """What is needed to use a model without its dataset, as JSON values.
 
     Attributes:
-        model: fields of :class:`ModelConfig`.
-        env: name of the environment it was trained on.
-        env_kwargs: how that environment was made.
-        action_low, action_high: bounds of a raw action [A], environment units.
-        config: the whole resolved configuration of the run that made it.
+        model: fields of :class:`ModelConfig`; empty for networks of your own.
+        env: name of the environment that it was trained on.
+        env_kwargs: keyword arguments of that environment.
+        action_low: lower bounds of an action [A], in environment units.
+        action_high: upper bounds of an action [A], in environment units.
+        config: the resolved configuration of the run that trained it.
 
     Raises:
         ValueError: a field of another type, or bounds that are no two lists of one length.
@@ -87,26 +98,25 @@ def save_pretrained(
     inverse_model: InverseDynamicsModel | None = None,
     card: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Writes a world model to share: weights, sizes, action statistics, and what else one must know about it.
+    """Writes a world model to a folder: weights, sizes, action statistics and a card.
 
-    Weights are written in float32, whatever precision the model is in; loading and saving again gives the same bits.
-    Keys of the modules are not kept: a loaded model reads and writes the package's standard ones.
+    Weights are written in float32; loading and saving again gives the same bits. Keys are not saved: a loaded model reads
+    and writes the default ones.
 
     Args:
-        model: of the package's own networks.
-        folder: made if missing; a model already there is replaced.
-        inverse_model: the judge that belongs to it.
-        card: JSON values to travel along. The fields of :class:`ModelCard` are understood
-            by the rest of the package: ``model``, ``env``, ``env_kwargs``, ``action_low``, ``action_high`` (bounds of
-            a raw action [A], environment units) and ``config``.
+        model (LatentWorldModel): a model of the package's own networks.
+        folder (str or Path): created if missing; a model already there is replaced.
+        inverse_model (InverseDynamicsModel, optional): its inverse dynamics model. Default: None.
+        card (mapping, optional): JSON values to save along. :func:`~torchrl_ficreg.trainers.load_world_model` needs the
+            fields of :class:`ModelCard`. Default: None.
 
     Returns:
         the folder.
 
     Raises:
         ImportError: safetensors is not installed.
-        TypeError: foreign networks, or a card with other than JSON values.
-        ValueError: a card that does not fit the model.
+        TypeError: networks other than the package's own, or a card with values that JSON does not have.
+        ValueError: a card that does not fit the model, or a network that was changed since it was built.
 
     Examples:
         >>> import tempfile
@@ -115,7 +125,7 @@ def save_pretrained(
         >>> card = {"env": "two_room", "action_low": [-1.0, -1.0], "action_high": [1.0, 1.0]}
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = save_pretrained(model, folder, inverse_model, card)
-        ...     same, judge, read = load_pretrained(folder)
+        ...     same, same_inverse, read = load_pretrained(folder)
         >>> read == card, torch.equal(same.predictor.module.position, model.predictor.module.position)
         (True, True)
     """
@@ -143,11 +153,11 @@ def save_pretrained(
 def load_pretrained(
     folder: Path | str, *, device: torch.device | str = "cpu"
 ) -> tuple[LatentWorldModel, InverseDynamicsModel | None, dict[str, Any]]:
-    """Reads what :func:`save_pretrained` wrote.
+    """Loads a folder that :func:`save_pretrained` wrote.
 
     Args:
-        folder: with ``config.json`` and ``model.safetensors``.
-        device: where the networks go.
+        folder (str or Path): with ``config.json`` and ``model.safetensors``.
+        device (torch.device or str, optional): device of the networks. Default: ``"cpu"``.
 
     Returns:
         the world model with its action statistics, the inverse dynamics model if one was saved, both in eval mode,
@@ -192,6 +202,91 @@ def load_pretrained(
     for part in parts.values():
         part.to(device).eval()
     return model, inverse_model, card
+
+
+def world_model_sizes(model: LatentWorldModel) -> Sizes:
+    """``encoder``, ``predictor`` and ``frame_skip`` of a world model: the arguments of its networks.
+
+    Raises:
+        TypeError: networks other than the package's own.
+        ValueError: one of them was changed since it was built, such as the dropout of one layer.
+
+    Examples:
+        >>> from torchrl_ficreg import make_world_model, ModelConfig
+        >>> model, _ = make_world_model(ModelConfig.preset("cpu"), action_dim=2)
+        >>> world_model_sizes(model)["encoder"]["kind"]
+        'conv'
+    """
+    encoder, predictor = _own_network(model.encoder, _ENCODER_ARGUMENTS), _own_network(model.predictor, (CausalTransformer,))
+    kind, *names = _ENCODER_ARGUMENTS[type(encoder)]
+    sizes = {
+        "encoder": {"kind": kind, **{name: encoder.arguments[name] for name in names}},
+        "predictor": {name: value for name, value in predictor.arguments.items() if name != "position_std"},
+        "frame_skip": model.frame_skip,
+    }
+    if "channels" in names:
+        sizes["encoder"]["channels"] = list(sizes["encoder"]["channels"])
+    _check_same(model, build_world_model, sizes)
+    return sizes
+
+
+def build_world_model(sizes: Sizes) -> LatentWorldModel:
+    """The world model that :func:`world_model_sizes` describes, with fresh weights."""
+    arguments = dict(sizes["encoder"])
+    encoder = _ENCODERS[arguments.pop("kind")](**arguments)
+    return LatentWorldModel(encoder, CausalPredictor(**sizes["predictor"]), frame_skip=sizes["frame_skip"])
+
+
+def inverse_model_sizes(inverse_model: InverseDynamicsModel) -> Sizes:
+    """``kind`` and arguments of an inverse dynamics model.
+
+    Raises:
+        TypeError: a network other than the package's own.
+        ValueError: it was changed since it was built.
+    """
+    kinds = {make: kind for kind, (make, _) in INVERSE_NETWORKS.items()}
+    network = _own_network(inverse_model, kinds)
+    sizes = {"kind": kinds[type(network)], **network.arguments}
+    _check_same(inverse_model, build_inverse_model, sizes)
+    return sizes
+
+
+def build_inverse_model(sizes: Sizes) -> InverseDynamicsModel:
+    """The inverse dynamics model that :func:`inverse_model_sizes` describes, with fresh weights."""
+    return InverseDynamicsModel(**sizes)
+
+
+def _own_network(module: nn.Module, known: Collection[type[nn.Module]]) -> nn.Module:
+    network = module.module if isinstance(module, TensorDictModule) else module
+    if type(network) not in known:
+        names = ", ".join(sorted(kind.__name__ for kind in known))
+        raise TypeError(f"only the package's own networks can be described ({names}), got {type(network).__name__}.")
+    return network
+
+
+def _check_same(module: nn.Module, build: Callable[[Sizes], nn.Module], sizes: Sizes) -> None:
+    """Compares every layer with that of the network that will be built from the sizes.
+
+    Raises:
+        ValueError: a layer differs.
+    """
+    with torch.device("meta"):
+        built = build(sizes)
+    theirs = {name: _settings(layer) for name, layer in built.named_modules()}
+    for name, layer in module.named_modules():
+        name, ours = name.replace("_orig_mod.", ""), _settings(layer)
+        if theirs.get(name, ours) != ours:
+            raise ValueError(
+                f"layer {name} is {ours}, built anew it would be {theirs[name]}: save a model as it was built, without changes "
+                "to single layers."
+            )
+    check_shapes(built.state_dict(), {name: value.shape for name, value in module.state_dict().items()})
+
+
+def _settings(layer: nn.Module) -> str:
+    """What no weight of a layer shows, such as a dropout rate."""
+    kind = "" if any(layer.children()) else type(layer).__name__  # torch.compile wraps others
+    return f"{kind}({layer.extra_repr()})"
 
 
 def _build(described: dict[str, Sizes]) -> dict[str, nn.Module]:

@@ -1,9 +1,8 @@
-"""Official LeWM checkpoints, ``config.json`` beside ``weights.pt``, to our world model and back."""
+"""Reads and writes official LeWM checkpoints, ``config.json`` beside ``weights.pt``."""
 
 from __future__ import annotations
 
 import io
-import math
 import pickle
 import zipfile
 import zlib
@@ -17,231 +16,8 @@ from torchrl_ficreg._safe_files import check_kinds, check_numbers, check_sizes, 
 from torchrl_ficreg._utils import read_json, require_regular_file
 from torchrl_ficreg.data.action_statistics import ActionStatistics
 from torchrl_ficreg.modules.world_model import LatentWorldModel
-from torchrl_ficreg.pretrained._lewm_names import matches, Naming, naming_of
-from torchrl_ficreg.pretrained._sizes import build_world_model, Sizes, world_model_sizes
-
-
-_VIT_SIZES = {  # width, depth, heads; the MLP has four times the width
-    "tiny": (192, 12, 3),
-    "small": (384, 12, 6),
-    "base": (768, 12, 12),
-    "large": (1024, 24, 16),
-    "huge": (1280, 32, 16),
-}
-_VIT_FIELDS = ("hidden_size", "num_hidden_layers", "num_attention_heads", "intermediate_size")
-_DIM_HEAD = 64  # where the published predictor is not told otherwise
-_LEWM = "stable_worldmodel.wm.lewm"
-_MODELS = ("LeWM", "JEPA")
-_TARGETS = {  # classes by which the parts may be called; the second names are those of the paper's release
-    "encoder": ("vit_hf",),
-    "predictor": ("Predictor", "ARPredictor"),
-    "action_encoder": ("Embedder",),
-    "projector": ("MLP",),
-    "pred_proj": ("MLP",),
-}
-_READ = {  # fields that say a size, or nothing about the network
-    "encoder": {"size", "patch_size", "image_size", "pretrained", "use_mask_token", *_VIT_FIELDS},
-    "predictor": {
-        *("num_frames", "input_dim", "hidden_dim", "output_dim"),
-        *("depth", "heads", "mlp_dim", "dim_head", "dropout"),
-    },
-    "action_encoder": {"input_dim", "smoothed_dim", "emb_dim"},
-    "projector": {"input_dim", "hidden_dim", "output_dim"},
-    "pred_proj": {"input_dim", "hidden_dim", "output_dim"},
-}
-_FIXED = {  # fields that our networks leave no choice in
-    "encoder": {
-        "hidden_act": "gelu",
-        "layer_norm_eps": 1e-12,
-        "qkv_bias": True,
-        "num_channels": 3,
-        "hidden_dropout_prob": 0.0,
-        "attention_probs_dropout_prob": 0.0,
-    },
-    "predictor": {"emb_dropout": 0.0},
-    "action_encoder": {"mlp_scale": 4},
-    "projector": {"norm_fn": "BatchNorm1d", "act_fn": "GELU"},
-    "pred_proj": {"norm_fn": "BatchNorm1d", "act_fn": "GELU"},
-}
-
-
-def sizes_from_config(config: dict[str, Any], tensors: dict[str, torch.Tensor], frame_skip: int) -> Sizes:
-    """What to build for a checkpoint. Sizes that ``config`` does not name are read off the shapes of ``tensors``.
-
-    Args:
-        config: content of ``config.json``.
-        tensors: published names and tensors.
-        frame_skip: F, raw actions in one block; the files do not say it.
-
-    Returns:
-        as :func:`~torchrl_ficreg.pretrained._sizes.world_model_sizes`.
-
-    Raises:
-        ValueError: networks that ours cannot stand for, or a size that neither config nor shapes tell.
-    """
-    if "encoder" not in config and isinstance(config.get("model"), dict):
-        config = config["model"]  # the configuration of a whole run
-    whole = _class_name(config)
-    if whole not in _MODELS:
-        raise ValueError(f"config.json asks for {whole}, not for a {' or '.join(_MODELS)}.")
-    for part in _TARGETS:
-        _check_part(part, config.get(part))
-    read = _Sizes(config, tensors)
-    vit = config["encoder"].get("size", "tiny")
-    if vit not in _VIT_SIZES:
-        raise ValueError(f"config.json: encoder.size must be one of {sorted(_VIT_SIZES)}, got {vit!r}.")
-    vit_width, vit_depth, vit_heads = _VIT_SIZES[vit]
-    patch = read("encoder.patch_size", "encoder.embeddings.patch_embeddings.projection.weight", 2)
-    tokens = "encoder.embeddings.position_embeddings"
-    width = read("predictor.hidden_dim", "predictor.transformer.norm.weight")
-    ends = [read(f"predictor.{end}_dim", default=width) for end in ("input", "output")]
-    if ends != [width, width]:
-        raise ValueError(
-            f"config.json: a predictor of width {width} between latents of width {ends[0]} and {ends[1]} holds "
-            "projections that ours does not have; only equal widths can be read."
-        )
-    dropout = config["predictor"].get("dropout", 0.0)
-    if isinstance(dropout, bool) or not isinstance(dropout, (int, float)) or not 0 <= dropout < 1:
-        raise ValueError(f"config.json: predictor.dropout must lie in [0, 1), got {str(dropout)[:40]!r}.")
-    latent_dim = read("projector.output_dim", "projector.net.3.weight", 0)
-    encoder = {
-        "kind": "vit",
-        "image_size": read("encoder.image_size", tokens, 1, of=lambda tokens: math.isqrt(tokens - 1) * patch),
-        "patch_size": patch,
-        "width": read("encoder.hidden_size", default=vit_width),
-        "depth": read("encoder.num_hidden_layers", default=vit_depth),
-        "heads": read("encoder.num_attention_heads", default=vit_heads),
-        "mlp_dim": read("encoder.intermediate_size", default=4 * vit_width),
-        "projector_dim": read("projector.hidden_dim", "projector.net.0.weight", 0),
-        "latent_dim": latent_dim,
-    }
-    predictor = {
-        "latent_dim": latent_dim,
-        "action_dim": read("action_encoder.input_dim", "action_encoder.patch_embed.weight", 1),
-        "history": read("predictor.num_frames", "predictor.pos_embedding", 1),
-        "width": width,
-        "depth": read("predictor.depth", default=_count(tensors, "predictor.transformer.layers.")),
-        "heads": read("predictor.heads"),
-        "dim_head": read("predictor.dim_head", default=_DIM_HEAD),
-        "mlp_dim": read("predictor.mlp_dim", "predictor.transformer.layers.0.mlp.net.1.weight", 0),
-        "dropout": dropout,
-        "attention_dropout": dropout,  # the published predictor has one rate for both
-        "projector_dim": read("pred_proj.hidden_dim", "pred_proj.net.0.weight", 0),
-        "action_bottleneck": read("action_encoder.smoothed_dim", "action_encoder.patch_embed.weight", 0),
-    }
-    return {"encoder": encoder, "predictor": predictor, "frame_skip": frame_skip}
-
-
-def config_from_sizes(sizes: Sizes) -> dict[str, Any]:
-    """The ``config.json`` from which the published loader builds the same networks.
-
-    Raises:
-        ValueError: networks that the published code cannot stand for.
-    """
-    encoder, predictor = sizes["encoder"], sizes["predictor"]
-    if encoder["kind"] != "vit":
-        raise ValueError(f"a LeWM checkpoint holds a vision transformer, this model a {encoder['kind']!r} encoder.")
-    width = predictor["width"]
-    if predictor["latent_dim"] != width:
-        raise ValueError(
-            f"LeWM's predictor is as wide as the latent; this one is {width} wide, for latents of "
-            f"{predictor['latent_dim']}: build it with predictor_width equal to latent_dim."
-        )
-    if predictor["heads"] == 1 and predictor["dim_head"] == width:
-        raise ValueError("LeWM's predictor has no output projection when a single head has the full width; ours has.")
-    rates = predictor["dropout"], predictor["attention_dropout"]
-    if rates[0] != rates[1]:
-        raise ValueError(
-            f"LeWM's predictor has one dropout for its layers and its attention weights, this one {rates[0]} and {rates[1]}: "
-            "build it with predictor_attention_dropout equal to predictor_dropout."
-        )
-    vit = (encoder["width"], encoder["depth"], encoder["heads"], encoder["mlp_dim"])
-    named = next((name for name, shape in _VIT_SIZES.items() if vit == (*shape, 4 * shape[0])), None)
-    return {
-        "_target_": f"{_LEWM}.LeWM",
-        "encoder": {
-            "_target_": "stable_pretraining.backbone.utils.vit_hf",
-            "size": named or "tiny",
-            "patch_size": encoder["patch_size"],
-            "image_size": encoder["image_size"],
-            "pretrained": False,
-            "use_mask_token": False,
-            **({} if named else dict(zip(_VIT_FIELDS, vit))),
-        },
-        "predictor": {
-            "_target_": f"{_LEWM}.module.Predictor",
-            "num_frames": predictor["history"],
-            **dict.fromkeys(("input_dim", "hidden_dim", "output_dim"), width),
-            **{field: predictor[field] for field in ("depth", "heads", "mlp_dim", "dim_head", "dropout")},
-            "emb_dropout": 0.0,
-        },
-        "action_encoder": {
-            "_target_": f"{_LEWM}.module.Embedder",
-            "input_dim": predictor["action_dim"],
-            "smoothed_dim": predictor["action_bottleneck"],
-            "emb_dim": width,
-        },
-        "projector": _projector_config(encoder["width"], encoder["projector_dim"], encoder["latent_dim"]),
-        "pred_proj": _projector_config(width, predictor["projector_dim"], predictor["latent_dim"]),
-    }
-
-
-class _Sizes:
-    """Sizes of a checkpoint: the config's word, else a default, else the shape of a tensor."""
-
-    def __init__(self, config: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
-        self.config, self.tensors = config, tensors
-
-    def __call__(self, field: str, tensor: str | None = None, axis: int = 0, *, default: int | None = None, of=int):
-        part, _, name = field.partition(".")
-        value = self.config[part].get(name)
-        if value is None:
-            value = default
-        if value is None and tensor in self.tensors and self.tensors[tensor].ndim > axis:
-            value = of(self.tensors[tensor].shape[axis])
-        if not isinstance(value, int) or value < 1:
-            wanted = f"the tensor {tensor} tells it" if tensor else "no tensor tells it"
-            raise ValueError(f"config.json: {field} must be a positive integer, got {value!r} ({wanted}).")
-        return value
-
-
-def _check_part(part: str, fields: Any) -> None:
-    """One section of the config asks for the network that ours is."""
-    name = _class_name(fields)
-    if name in ("None", "Identity") and part in ("projector", "pred_proj"):
-        raise ValueError(f"config.json: the model was trained without {part!r}; ours always ends in a projector.")
-    if not isinstance(fields, dict) or name not in _TARGETS[part]:
-        raise ValueError(f"config.json: {part} must be a {' or '.join(_TARGETS[part])}, got {name}.")
-    fixed, projector = _FIXED[part], part in ("projector", "pred_proj")
-    unknown = sorted(fields.keys() - _READ[part] - fixed.keys() - {"_target_"})
-    if unknown:
-        raise ValueError(f"config.json: {part} has fields {unknown}, of which it is not known what they change.")
-    given = {field: _class_name(fields[field]) if projector else fields[field] for field in fixed if field in fields}
-    if projector:
-        given.setdefault("norm_fn", "LayerNorm")  # the published class's own choice
-    wrong = [f"{field}={value!r}, not {fixed[field]!r}" for field, value in given.items() if value != fixed[field]]
-    if wrong:
-        raise ValueError(f"config.json: {part} differs from our network ({'; '.join(wrong)}).")
-
-
-def _class_name(node: Any) -> str:
-    target = node.get("_target_", "no _target_") if isinstance(node, dict) else node
-    return str(target).rpartition(".")[2]
-
-
-def _count(tensors: dict[str, torch.Tensor], prefix: str) -> int:
-    return len({name[len(prefix) :].partition(".")[0] for name in tensors if name.startswith(prefix)})
-
-
-def _projector_config(in_dim: int, hidden_dim: int, out_dim: int) -> dict[str, Any]:
-    return {
-        "_target_": f"{_LEWM}.module.MLP",
-        "input_dim": in_dim,
-        "hidden_dim": hidden_dim,
-        "output_dim": out_dim,
-        "norm_fn": {"_target_": "torch.nn.BatchNorm1d", "_partial_": True},
-    }
-
+from torchrl_ficreg.pretrained._lewm_names import config_from_sizes, matches, Naming, naming_of, sizes_from_config
+from torchrl_ficreg.pretrained.folder import build_world_model, world_model_sizes
 
 _CONFIG, _WEIGHTS = "config.json", "weights.pt"
 _WRAPPERS = ("state_dict", "model")
@@ -257,25 +33,24 @@ def load_lewm(
     frame_skip: int = 5,
     statistics: ActionStatistics | None = None,
 ) -> LatentWorldModel:
-    """Reads an official LeWM checkpoint (arXiv 2603.19312), in eval mode and float32.
+    """Loads an official LeWM checkpoint (arXiv 2603.19312), in eval mode and float32.
 
-    Its encoder and predictor give the numbers of the published code. Two things are not in the files: the frame skip,
-    5 in all published models, and the mean and std of raw actions. Without ``statistics`` the model keeps means of 0
-    and stds of 1 and its planners would act in z-scores, so give those of the dataset it was trained on, or set
-    ``model.statistics`` later.
+    Encoder and predictor give the same numbers as the published code. The files contain neither the frame skip, 5 in all
+    published models, nor the mean and std of actions. Without ``statistics`` the model has means of 0 and stds of 1, and
+    its planners would act in z-scores: give those of its training dataset, or set ``model.statistics`` later.
 
-    Tensors may bear the names of transformers 4 or 5, a prefix ``model.`` and a wrapper ``state_dict``, as a Lightning
-    checkpoint does; buffers of the loss and a mask token are left out. Nothing in the file is executed.
+    Tensors may have the names of transformers 4 or 5, a prefix ``model.`` and a wrapper ``state_dict``, as in a Lightning
+    checkpoint; buffers of the loss and a mask token are ignored. No code in the file is executed.
 
     Args:
-        path: a folder with ``config.json`` and one ``.pt`` file, or a file with ``config.json`` beside it.
-        device: where the model goes.
-        frame_skip: F, raw actions in one block.
-        statistics: mean and std [A] of raw actions, environment units.
+        path (str or Path): a folder with ``config.json`` and one ``.pt`` file, or such a file beside ``config.json``.
+        device (torch.device or str, optional): device of the model. Default: ``"cpu"``.
+        frame_skip (int, optional): F, environment actions in one block. Default: ``5``.
+        statistics (ActionStatistics, optional): mean and std [A] of actions in environment units. Default: zeros and ones.
 
     Raises:
-        FileNotFoundError: no such checkpoint, or no config.
-        ValueError: several weight files; an object checkpoint; networks that ours cannot stand for; tensors that are
+        FileNotFoundError: no such checkpoint, or no configuration.
+        ValueError: several weight files; an object checkpoint; networks that differ from the package's; tensors that are
             missing, unexpected or of another shape.
 
     Examples:
@@ -310,21 +85,21 @@ def load_lewm(
 def save_lewm(model: LatentWorldModel, folder: Path | str, *, naming: Naming = "transformers4") -> Path:
     """Writes a world model as an official LeWM checkpoint, for the published loader or :func:`load_lewm`.
 
-    Weights are written in float32, whatever precision the model is in. Action statistics and frame skip have no place
-    in that format: keep them elsewhere.
+    Weights are written in float32. The format has no action statistics and no frame skip: keep them elsewhere.
 
     Args:
-        model: with a vision transformer, and a predictor as wide as the latent.
-        folder: made if missing; must hold no other ``.pt`` file, for the published loader refuses several.
-        naming: ``"transformers4"``, as in the released weights, or ``"transformers5"``: the installed release of
-            ``transformers`` decides which one the published loader wants.
+        model (LatentWorldModel): with a vision transformer, and a predictor as wide as the latent.
+        folder (str or Path): created if missing; may contain no other ``.pt`` file, as the published loader refuses
+            several.
+        naming (str, optional): ``"transformers4"``, as in the released weights, or ``"transformers5"``. The published
+            loader needs that of the installed release of ``transformers``. Default: ``"transformers4"``.
 
     Returns:
         the folder.
 
     Raises:
         TypeError: networks other than the package's own.
-        ValueError: an unknown naming, networks that LeWM cannot stand for, or other weights in the folder.
+        ValueError: an unknown naming, networks that LeWM does not have, or other weights in the folder.
     """
     if naming not in ("transformers4", "transformers5"):
         raise ValueError(f"naming must be 'transformers4' or 'transformers5', got {naming!r}.")
@@ -346,7 +121,7 @@ def save_lewm(model: LatentWorldModel, folder: Path | str, *, naming: Naming = "
 
 
 def _find(path: Path) -> tuple[Path, dict[str, Any]]:
-    """The weight file that a path means, and the configuration beside it."""
+    """Finds the file of weights and reads the configuration beside it."""
     if path.is_dir():
         files = sorted(path.glob("*.pt"))
         if len(files) > 1:
@@ -370,12 +145,12 @@ def _find(path: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def _read_tensors(file: Path) -> dict[str, torch.Tensor]:
-    """Tensors of a checkpoint under their bare published names; nothing in the file is executed."""
+    """Reads the tensors of a checkpoint by their published names, without prefixes; executes no code in the file."""
     size = require_regular_file(file).st_size
     try:
         _check_archive(file, size)
         content = torch.load(file, map_location="cpu", weights_only=True)
-    # A damaged pickle raises whatever its instructions meet.
+    # A damaged pickle may raise any of these.
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{file} is no plain state dict. Whole pickled modules (*_object.ckpt) and checkpoints with objects in "
@@ -396,7 +171,7 @@ def _read_tensors(file: Path) -> dict[str, torch.Tensor]:
             what = "comes twice" if name in tensors else f"is a {type(value).__name__}, no tensor"
             raise ValueError(f"{file}: {name!r} {what}: save the state_dict() of the model alone.")
         tensors[name] = value
-    # A tensor may repeat the bytes of its storage, and several may share one: copied, they would take more than the file.
+    # Expanded tensors and tensors that share a storage would take more memory than the file when copied.
     if any(value.device.type != "cpu" or value.layout != torch.strided or value.is_nested for value in tensors.values()):
         raise ValueError(f"{file} holds tensors that are not plain arrays: save the state_dict() of the model on the CPU.")
     need = sum(value.numel() * value.element_size() for value in tensors.values())
@@ -407,12 +182,12 @@ def _read_tensors(file: Path) -> dict[str, torch.Tensor]:
 
 
 def _check_archive(file: Path, size: int) -> None:
-    """Refuses an archive that unpacks to more than its size: PyTorch stores tensors as they are.
+    """Checks that an archive does not unpack to more than its size: PyTorch stores tensors without compression.
 
     Raises:
-        ValueError: it does, or it is no archive, as PyTorch writes since 1.6.
+        ValueError: it does, or it is no archive of PyTorch 1.6 or later.
     """
-    with open(file, "rb") as content:  # an archive may be appended to anything, and PyTorch looks at the beginning
+    with open(file, "rb") as content:  # zipfile also opens archives appended to other data, which PyTorch reads as pickles
         if content.read(4) != b"PK\x03\x04":
             raise ValueError("no archive of PyTorch")
     try:
@@ -432,7 +207,7 @@ def _bare(name: str) -> str:
 
 
 def _adopt(model: LatentWorldModel, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Our state, without action statistics, from published tensors, every one of which must have its place."""
+    """Converts published tensors to the state of a world model without its action statistics; all must be used."""
     state = model.state_dict()
     table = matches(world_model_sizes(model), naming_of(list(tensors)))
     shapes = {name: match.published_shape(state[match.ours]) for match in table for name in match.theirs}

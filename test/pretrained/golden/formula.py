@@ -1,7 +1,7 @@
 """Weights and inputs by formula, so that golden files hold nothing but outputs. Needs torch alone.
 
-The published table of tensors is written down here too: ``test_pretrained.py`` builds checkpoints from it, and
-``sota-check/make_golden_lewm.py`` compares it with the published networks.
+The published table of tensors is written down here too: ``test_lewm.py`` builds checkpoints from it, and
+``test/pretrained/golden/make_lewm.py`` compares it with the published networks.
 """
 
 from __future__ import annotations

@@ -1,55 +1,29 @@
-"""Claims about weights in and out.
+"""Official LeWM checkpoints give, in our modules, the numbers of the published code, and are written back as they were.
 
-An official LeWM checkpoint, whatever its names, gives in our modules the numbers of the published code, and comes back
-out as it was; what ours cannot stand for is refused by name, and nothing in a file is ever executed. The golden tensors
-were computed once by the published code (``sota-check/make_golden_lewm.py``) from weights and inputs by formula.
+Networks that ours do not have are refused by name, and no code in a file is executed. The golden tensors were computed by
+the published code (``test/pretrained/golden/make_lewm.py``) from weights and inputs by formula.
 """
 
 from __future__ import annotations
 
-import errno
 import json
 import os
-import sys
 import time
 import zipfile
 from pathlib import Path
 
 import pytest
 import torch
+from checkpoints import assert_same, write
 from golden.formula import ENCODER_NAMES, inputs, published_config, published_shapes, weights
 
-from torchrl_ficreg import InverseDynamicsModel, make_world_model, ModelConfig
+from torchrl_ficreg import make_world_model, ModelConfig
 from torchrl_ficreg.data import ActionStatistics
-from torchrl_ficreg.pretrained import load_lewm, load_pretrained, save_lewm, save_pretrained
-from torchrl_ficreg.pretrained._sizes import build_world_model, world_model_sizes
+from torchrl_ficreg.pretrained import load_lewm, save_lewm
+from torchrl_ficreg.pretrained.folder import build_world_model, world_model_sizes
 
 GOLDEN = Path(__file__).parent / "golden"
-LEWM = {"encoder": "vit", "image_size": 14, "latent_dim": 8, "predictor_heads": 2, "predictor_dim_head": 4}
-LEWM |= {"predictor_dropout": 0.1, "predictor_attention_dropout": 0.1}
 LOSS_BUFFERS = {"sigreg.t": torch.ones(17), "sigreg.phi": torch.ones(17), "sigreg.weights": torch.ones(17)}
-
-
-def write(folder, tensors, config=None, name="weights.pt"):
-    folder.mkdir(exist_ok=True, parents=True)
-    torch.save(tensors, folder / name)
-    (folder / "config.json").write_text(json.dumps(config if config is not None else published_config("tiny")))
-    return folder
-
-
-def assert_same(model, other):
-    state, expected = model.state_dict(), other.state_dict()
-    assert state.keys() == expected.keys()
-    for name, tensor in expected.items():
-        assert torch.equal(state[name], tensor) and state[name].dtype == tensor.dtype, name
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory):
-    return load_lewm(write(tmp_path_factory.mktemp("tiny"), weights("tiny")))
-
-
-# Official checkpoints: names and numbers
 
 
 @pytest.mark.parametrize("naming", ENCODER_NAMES)
@@ -181,7 +155,7 @@ def test_names_of_the_papers_release_and_a_whole_runs_config_are_understood(tiny
     assert_same(load_lewm(write(tmp_path, weights("tiny"), {"model": config, "seed": 1})), tiny)
 
 
-# Official checkpoints: refusals
+# Refusals
 
 
 def without(name):
@@ -302,7 +276,7 @@ def test_a_damaged_file_is_refused(content, tmp_path):
         load_lewm(folder)
 
 
-# Official checkpoints: the way back
+# Writing
 
 
 @pytest.mark.parametrize("naming", ENCODER_NAMES)
@@ -357,153 +331,7 @@ def test_foreign_networks_and_namings_are_refused(linear_world, tiny, tmp_path):
         save_lewm(tiny, tmp_path, naming="timm")
 
 
-# Our own format
-
-
-@pytest.fixture
-def safetensors():
-    return pytest.importorskip("safetensors", reason="safetensors is not installed: torchrl_ficreg[pretrained]")
-
-
-CARD = {
-    "model": {"image_size": 16, "latent_dim": 6},
-    "env": "two_room",
-    "env_kwargs": {"noise": 0.1},
-    "action_low": [-1.0, -1.0],
-    "action_high": [1.0, 1.0],
-    "config": {"seed": 3},
-}
-
-
-@pytest.mark.parametrize("kind", ["mlp", "gaussian", "ensemble", "transformer"])
-def test_a_model_its_judge_and_its_card_come_back_as_they_were(safetensors, tiny_world, kind, tmp_path):
-    model = tiny_world()
-    model.statistics = ActionStatistics(torch.tensor([0.1, -2.0]), torch.tensor([0.3, 1 / 3]))
-    extra = {"history": 3, "heads": 2} if kind == "transformer" else {}
-    judge = InverseDynamicsModel(6, 4, 16, 0.25, kind=kind, **extra)
-    back, same_judge, card = load_pretrained(save_pretrained(model, tmp_path, judge, CARD))
-    assert_same(back, model)
-    assert_same(same_judge, judge)
-    assert card == CARD
-    assert (back.training, same_judge.training, back.frame_skip) == (False, False, 2)
-    assert str(same_judge.module) == str(judge.module)  # dropout and heads included
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["config.json", "model.safetensors"]
-
-
-def test_a_lewm_model_of_any_size_can_be_kept(safetensors, tiny, tmp_path):
-    back, judge, card = load_pretrained(save_pretrained(tiny, tmp_path))
-    assert_same(back, tiny)
-    assert (judge, card) == (None, {})
-
-
-def test_the_config_is_for_reading(safetensors, tiny_world, tmp_path):
-    content = json.loads((save_pretrained(tiny_world(), tmp_path, card=CARD) / "config.json").read_text())
-    assert (content["format"], content["version"]) == ("torchrl_ficreg.world_model", 1)
-    assert content["world_model"]["predictor"]["history"] == 3
-    assert content["statistics"] == {"mean": [0.0, 0.0], "std": [1.0, 1.0]}
-    assert content["card"]["action_high"] == [1.0, 1.0]
-
-
-def edited(**changes):
-    return lambda content: content.update(changes)
-
-
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (edited(version=2), "has version 2, this release reads 1: update torchrl_ficreg"),
-        (edited(format="other"), "is not of the format 'torchrl_ficreg.world_model'"),
-        (edited(statistics={"mean": [9.0, 0.0], "std": [1.0, 1.0]}), "hold different statistics"),
-        (lambda content: content.pop("world_model"), "does not describe a world model"),
-        (lambda content: content["world_model"]["encoder"].update(kind="timm"), "does not describe a world model"),
-        (lambda content: content["world_model"]["predictor"].update(depth=1), "13 tensors are missing, left over or"),
-        (lambda content: content["world_model"]["predictor"].update(mlp_dim=17), "6 tensors are missing, left .*mlp.0"),
-        (edited(inverse_model=None), "tensors are missing, left over .*: inverse_model.module.layers.0.bias"),
-    ],
-)
-def test_files_that_do_not_belong_together_are_refused(safetensors, tiny_world, edit, message, tmp_path):
-    save_pretrained(tiny_world(), tmp_path, InverseDynamicsModel(6, 4, 16))
-    content = json.loads((tmp_path / "config.json").read_text())
-    edit(content)
-    (tmp_path / "config.json").write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=message):
-        load_pretrained(tmp_path)
-
-
-def test_a_truncated_file_is_refused(safetensors, tiny_world, tmp_path):
-    weights_file = save_pretrained(tiny_world(), tmp_path) / "model.safetensors"
-    weights_file.write_bytes(weights_file.read_bytes()[:-10])
-    with pytest.raises(ValueError, match="model.safetensors is damaged"):
-        load_pretrained(tmp_path)
-    weights_file.unlink()
-    with pytest.raises(FileNotFoundError, match="no model.safetensors in"):
-        load_pretrained(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("card", "error", "message"),
-    [
-        ({"action_low": [-1.0]}, ValueError, r"acts in 2 dimensions, card\['action_low'\] has 1"),
-        ({"model": {"image_size": 224}}, ValueError, "describes another model: image_size 224, not 16"),
-        ({"env_kwargs": {"path": Path("x")}}, TypeError, "the card must hold JSON values only"),
-    ],
-)
-def test_a_card_that_does_not_fit_is_refused(safetensors, tiny_world, card, error, message, tmp_path):
-    with pytest.raises(error, match=message):
-        save_pretrained(tiny_world(), tmp_path, card=card)
-    assert not list(tmp_path.iterdir())
-
-
-def test_without_safetensors_the_extra_is_named(tiny_world, monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "safetensors.torch", None)
-    with pytest.raises(ImportError, match=r"pip install 'torchrl_ficreg\[pretrained\]'"):
-        save_pretrained(tiny_world(), tmp_path)
-
-
-# Foreign, damaged and half-written files
-
-
-@pytest.fixture
-def at_most(monkeypatch):
-    """Bytes of address space that this process may still take while a file is read."""
-    resource = pytest.importorskip("resource")
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 2**30, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_AS, before)
-
-
-@pytest.mark.parametrize("size", [10**6, 10**9, 10**30, -1, 0, 1.5, float("nan"), True, "8", "", None, [4], [], {}])
-@pytest.mark.parametrize(
-    ("part", "field"),
-    [
-        ("encoder", "image_size"),
-        ("encoder", "latent_dim"),
-        ("encoder", "projector_dim"),
-        ("predictor", "width"),
-        ("predictor", "depth"),
-        ("predictor", "heads"),
-        ("predictor", "mlp_dim"),
-        ("predictor", "history"),
-        ("predictor", "dropout"),
-        ("predictor", "attention_dropout"),
-        ("encoder", "channels"),
-        ("inverse_model", "hidden_dim"),
-    ],
-)
-def test_sizes_that_the_weights_do_not_have_take_no_memory(safetensors, tiny_world, part, field, size, tmp_path, at_most):
-    """Compared with the file before anything is built: at most a gigabyte may be taken, and little time."""
-    save_pretrained(tiny_world(), tmp_path, InverseDynamicsModel(6, 4, 16))
-    content = json.loads((tmp_path / "config.json").read_text())
-    if field.endswith("dropout") and size == 0:
-        return  # a rate that is one
-    (content if part == "inverse_model" else content["world_model"])[part][field] = size
-    (tmp_path / "config.json").write_text(json.dumps(content))
-    began = time.monotonic()
-    with pytest.raises(ValueError, match="does not describe a world model|does not fit") as caught:
-        load_pretrained(tmp_path)
-    assert time.monotonic() - began < 5 and "\n" not in str(caught.value) and len(str(caught.value)) < 400
+# Damaged and hostile files
 
 
 @pytest.mark.parametrize(("part", "field"), [("predictor", "depth"), ("predictor", "heads"), ("encoder", "image_size")])
@@ -539,105 +367,3 @@ def test_tensors_of_other_kinds_than_weights_are_refused(tiny, change, tmp_path)
     with pytest.raises(ValueError, match="would take|not plain arrays|has dtype|holds a NaN") as caught:
         load_lewm(write(tmp_path, tensors, published_config("tiny")))
     assert "\n" not in str(caught.value)
-
-
-def test_every_rate_comes_back(safetensors, tiny_world, tmp_path):
-    """Those of the predictor, of its attention weights and of the inverse model; fine-tuning goes on as it was."""
-    model = tiny_world(predictor_dropout=0.25, predictor_attention_dropout=0.125)
-    judge = InverseDynamicsModel(6, 4, 16, dropout=0.5)
-    loaded, back, _ = load_pretrained(save_pretrained(model, tmp_path / "ours", judge))
-    for one, other in ((model, loaded), (judge, back)):
-        theirs = dict(other.named_modules())
-        for name, layer in one.named_modules():
-            for rate in ("p", "weight_dropout"):
-                assert getattr(layer, rate, None) == getattr(theirs[name], rate, None), name
-    with pytest.raises(ValueError, match="one dropout for .*, this one 0.25 and 0.125"):
-        save_lewm(tiny_world(**{**LEWM, "predictor_dropout": 0.25, "predictor_attention_dropout": 0.125}), tmp_path / "lewm")
-    same = tiny_world(**{**LEWM, "predictor_dropout": 0.25, "predictor_attention_dropout": 0.25})
-    block = load_lewm(save_lewm(same, tmp_path / "lewm"), frame_skip=same.frame_skip).predictor.module.blocks[0]
-    assert (block.attn.weight_dropout, block.attn.dropout.p, block.mlp[2].p) == (0.25, 0.25, 0.25)
-    model.predictor.module.blocks[0].mlp[2].p = 0.5
-    with pytest.raises(ValueError, match=r"blocks.0.mlp.2 has p=0.5, which the saved sizes do not tell"):
-        save_pretrained(model, tmp_path / "ours")
-
-
-@pytest.mark.parametrize("name", ["model.safetensors"])
-def test_a_flipped_byte_anywhere_is_found(safetensors, tiny_world, name, tmp_path):
-    file = save_pretrained(tiny_world(), tmp_path) / name
-    whole = file.read_bytes()
-    for at in range(0, len(whole), max(1, len(whole) // 60)):
-        file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
-        with pytest.raises(ValueError, match=f"{name}|does not fit"):
-            load_pretrained(tmp_path)
-    content = json.loads((tmp_path / "config.json").read_text())
-    del content["weights_sha256"]  # as folders of earlier releases
-    (tmp_path / "config.json").write_text(json.dumps(content))
-    file.write_bytes(whole)
-    load_pretrained(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("action_std", 0.0), ("action_std", -1.0), ("action_mean", float("nan")), ("action_std", float("inf"))],
-)
-def test_numbers_that_no_trained_network_has_are_refused(safetensors, tiny_world, name, value, tmp_path):
-    model = tiny_world()
-    model.get_buffer(name).fill_(value)
-    save_pretrained(model, tmp_path)
-    with pytest.raises(ValueError, match=f"{name} (holds a NaN|must be positive)"):
-        load_pretrained(tmp_path)
-    worse = tiny_world()
-    with torch.no_grad():
-        next(worse.parameters()).fill_(float("inf"))
-    with pytest.raises(ValueError, match="holds a NaN or an infinity"):
-        load_pretrained(save_pretrained(worse, tmp_path))
-
-
-def snapshot(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
-@pytest.mark.parametrize("at", range(1, 5))
-@pytest.mark.parametrize("format_name", ["pretrained", "lewm"])
-def test_a_save_that_fails_or_is_killed_at_any_write_leaves_a_whole_model(
-    safetensors, tiny_world, format_name, at, tmp_path, monkeypatch
-):
-    """The old one or the new one, never a mixture; the next save leaves nothing but its own files."""
-    old = tiny_world(**LEWM)
-    new = tiny_world(**{**LEWM, "predictor_heads": 4, "predictor_dim_head": 2})  # every tensor has the same shape
-    save, load = {
-        "pretrained": (save_pretrained, lambda folder: load_pretrained(folder)[0]),
-        "lewm": (save_lewm, lambda folder: load_lewm(folder, frame_skip=old.frame_skip)),
-    }[format_name]
-    save(old, tmp_path)
-    before, replace, calls = snapshot(tmp_path), os.replace, []
-
-    class Killed(BaseException):
-        pass
-
-    def failing(source, target):
-        calls.append(target)
-        if len(calls) == at:
-            raise OSError(errno.ENOSPC, "No space left on device") if at < 4 else Killed
-        replace(source, target)
-
-    monkeypatch.setattr(os, "replace", failing)
-    with pytest.raises((OSError, Killed)):
-        save(new, tmp_path)
-    monkeypatch.undo()
-    heads = {model.predictor.module.blocks[0].attn.heads: name for model, name in ((old, "old"), (new, "new"))}
-    found = heads[load(tmp_path).predictor.module.blocks[0].attn.heads]
-    assert found == ("old" if at < 4 else "new")
-    if at < 4:
-        assert snapshot(tmp_path) == before
-    save(old, tmp_path)
-    assert snapshot(tmp_path) == before
-
-
-@pytest.mark.parametrize("card", [None, [], "two_room"])
-def test_a_card_that_is_no_object_is_refused(safetensors, tiny_world, card, tmp_path):
-    save_pretrained(tiny_world(), tmp_path)
-    content = json.loads((tmp_path / "config.json").read_text())
-    (tmp_path / "config.json").write_text(json.dumps({**content, "card": card}))
-    with pytest.raises(ValueError, match="card must be a JSON object"):
-        load_pretrained(tmp_path)

@@ -7,5 +7,5 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def one_by_one(monkeypatch):
-    """Few candidates share calls among environments; one by one, equalities hold to the last bit, as with 257 or more."""
+    """Groups of one environment, as with 257 candidates or more: equalities then hold to the last bit."""
     monkeypatch.setattr("torchrl_ficreg.planners.base.ROWS_AT_ONCE", 1)

@@ -1,18 +1,18 @@
-"""Claims about the imagined environment: it steps as rollout() imagines, and TorchRL's own planners plan on it."""
+"""Claims about the imagined environment: its steps are those of rollout(), and TorchRL's own planners plan on it."""
 
 from __future__ import annotations
 
 import pytest
 import torch
+from making import UNIT
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules.planners import CEMPlanner, MPPIPlanner
 
-from torchrl_ficreg.planners.latent_env import LatentGoalEnv
+from torchrl_ficreg import LatentGoalEnv
 
 SEARCH = {"optim_steps": 8, "num_candidates": 64, "top_k": 8}
-UNIT = ([-1.0, -1.0], [1.0, 1.0])
 
 
 def start_of(latent, goal):
@@ -41,15 +41,15 @@ def mppi(env, horizon):
 
     def behind_best(reward):
         total = reward.sum(-2, keepdim=True)
-        spread = total.std(-3, keepdim=True).clamp_min(1e-6)
-        return ((total - total.amax(-3, keepdim=True)) / spread).expand_as(reward)
+        std = total.std(-3, keepdim=True).clamp_min(1e-6)
+        return ((total - total.amax(-3, keepdim=True)) / std).expand_as(reward)
 
     advantage = TensorDictModule(behind_best, [("next", "reward")], ["advantage"])
     return MPPIPlanner(env, advantage, temperature=1.0, planning_horizon=horizon, **SEARCH)
 
 
 def arrive(make, env, start, steps):
-    """Plans so many steps ahead as are left, each time anew; the last latent [..., D]."""
+    """Plans again after every step, as far ahead as there are steps left; returns the last latent [..., D]."""
     td = env.reset(start)
     for left in range(steps, 0, -1):
         td = env.step_mdp(env.step(make(env, left)(td)))
@@ -59,8 +59,8 @@ def arrive(make, env, start, steps):
 @pytest.mark.parametrize("bounds", [None, UNIT])
 @pytest.mark.parametrize("lead", [(), (4,), (2, 3)])
 @pytest.mark.parametrize("history", [1, 3])
-def test_its_specs_are_what_it_does(tiny_world, history, lead, bounds):
-    """TorchRL's check, at every batch size; the state is left out of that check and therefore compared here."""
+def test_its_specs_describe_its_steps(tiny_world, history, lead, bounds):
+    """TorchRL's check, at every batch size; it leaves out the state, which is compared here."""
     env = LatentGoalEnv(tiny_world(history=history), action_bounds=bounds)
     assert not env.batch_locked
     start = env.reset(random_start(*lead))
@@ -76,7 +76,7 @@ def test_its_specs_are_what_it_does(tiny_world, history, lead, bounds):
 @pytest.mark.parametrize("lead", [(), (4,), (2, 3)])
 @pytest.mark.parametrize("history", [1, 2, 3])
 def test_stepping_is_the_rollout_of_the_world_model(tiny_world, history, lead):
-    """Horizon 6 is longer than every window: it grows, then slides. In float64, so that any padding would show."""
+    """Horizon 6 is longer than every window: it grows, then slides. In float64, to detect any padding."""
     model = tiny_world(history=history).double()
     start, action = random_start(*lead).double(), torch.randn(*lead, 6, 4, dtype=torch.float64)
     played = play(LatentGoalEnv(model), start.clone(), action)
@@ -87,17 +87,20 @@ def test_stepping_is_the_rollout_of_the_world_model(tiny_world, history, lead):
 
 
 def test_the_past_is_what_was_executed(tiny_world):
-    """After five steps a predictor of history 3 has the last two latents and the blocks that led on from them."""
+    """After five steps a predictor of history 3 has the last two latents and the blocks after them; a reset clears them."""
     env, action = LatentGoalEnv(tiny_world()), torch.randn(2, 5, 4)
     played = play(env, random_start(2), action)
     last = played[:, -1]["next"]
     assert last["past_action"].equal(action[:, -2:])
     assert last["past_latent"].equal(played["latent"][:, -2:])
     assert played["past_length"][0, :, 0].tolist() == [0, 1, 2, 2, 2]
+    again = env.reset(last.clone())
+    assert again["latent"].equal(last["latent"])
+    assert not any(again[key].any() for key in ("past_length", "past_latent", "past_action"))
 
 
-def test_rows_that_started_at_different_times_do_not_mix(tiny_world):
-    """One tensordict of rows with no, one, two and four steps behind them steps as each row alone."""
+def test_rows_that_were_reset_at_different_times_do_not_mix(tiny_world):
+    """Rows that have made no, one, two and four steps get the same next step together as alone."""
     model = tiny_world().double()
     env, rows = LatentGoalEnv(model), []
     for steps in (0, 1, 2, 4):
@@ -112,20 +115,15 @@ def test_rows_that_started_at_different_times_do_not_mix(tiny_world):
         torch.testing.assert_close(together[key], alone[key], rtol=0, atol=1e-12)
 
 
-def test_progress_adds_up_to_the_terminal_distance(tiny_world):
-    start, action = random_start(4).double(), torch.randn(4, 5, 4, dtype=torch.float64)
-    model = tiny_world().double()
-    total = play(LatentGoalEnv(model), start.clone(), action)["next", "reward"].sum((-2, -1))
-    end = model.rollout(start["latent"].unsqueeze(-2), action)[:, -1]
-    expected = distance(start["latent"], start["goal_latent"]) - distance(end, start["goal_latent"])
-    torch.testing.assert_close(total, expected)
-
-
-def test_distance_is_that_of_every_imagined_latent(tiny_world):
-    start, action, model = random_start(4), torch.randn(4, 5, 4), tiny_world()
-    reward = play(LatentGoalEnv(model, reward="distance"), start.clone(), action)["next", "reward"]
-    path = model.rollout(start["latent"].unsqueeze(-2), action)
-    torch.testing.assert_close(reward, -distance(path, start["goal_latent"].unsqueeze(-2)).unsqueeze(-1))
+def test_rewards_are_progress_and_negative_distance(tiny_world):
+    """Progress adds up to the terminal distance, relative to that of the start."""
+    start, action, model = random_start(4).double(), torch.randn(4, 5, 4, dtype=torch.float64), tiny_world().double()
+    progress, negative = (
+        play(LatentGoalEnv(model, reward=reward), start.clone(), action)["next", "reward"] for reward in ("progress", "distance")
+    )
+    path, goal = model.rollout(start["latent"].unsqueeze(-2), action), start["goal_latent"]
+    torch.testing.assert_close(progress.sum((-2, -1)), distance(start["latent"], goal) - distance(path[:, -1], goal))
+    torch.testing.assert_close(negative, -distance(path, goal.unsqueeze(-2)).unsqueeze(-1))
 
 
 @pytest.mark.parametrize("make", [cem, mppi])
@@ -143,8 +141,8 @@ def test_stock_planners_reach_the_goal(linear_world, make, frame_skip, lead):
 
 @pytest.mark.parametrize("make", [cem, mppi])
 @pytest.mark.parametrize("frame_skip", [1, 3])
-def test_progress_makes_for_a_goal_that_needs_every_block(linear_world, make, frame_skip):
-    """Four fifths of what the bounds allow in three blocks: who dawdles in the first cannot arrive."""
+def test_with_progress_a_goal_that_needs_every_block_is_reached(linear_world, make, frame_skip):
+    """Four fifths of what the bounds allow in three blocks: every block must go towards the goal."""
     torch.manual_seed(0)
     env = LatentGoalEnv(linear_world(frame_skip), action_bounds=UNIT)
     goal = 0.8 * 3 * frame_skip * torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
@@ -178,8 +176,8 @@ def test_bounds_hold_in_every_dimension_of_every_sub_step(linear_world, make):
     assert (action[1, ::2] < -1.0).all()
 
 
-def test_planning_and_stepping_leave_their_input_alone(tiny_world):
-    """A planner adds ``action`` and a step adds ``next``, as TorchRL has it; nothing else changes."""
+def test_planning_and_stepping_do_not_change_their_input(tiny_world):
+    """A planner adds ``action`` and a step adds ``next``; nothing else changes."""
     env = LatentGoalEnv(tiny_world())
     td = env.step_mdp(env.rand_step(env.reset(random_start(3)))).exclude("action")
     before = td.clone()
@@ -191,7 +189,7 @@ def test_planning_and_stepping_leave_their_input_alone(tiny_world):
 
 
 def test_a_step_keeps_no_graph(tiny_world):
-    """Stock planners do not switch gradients off: 150 imagined steps would pile up."""
+    """TorchRL's planners do not switch gradients off: the graph of 150 imagined steps would accumulate."""
     model = tiny_world()
     env = LatentGoalEnv(model)
     assert any(param.requires_grad for param in model.parameters())
@@ -204,16 +202,6 @@ def test_a_world_model_in_train_mode_is_refused(tiny_world):
     model.predictor.train()
     with pytest.raises(ValueError, match=r"train mode.*call its eval\(\)"):
         env.reset(random_start(2))
-
-
-def test_a_fresh_reset_forgets_the_past(tiny_world):
-    env = LatentGoalEnv(tiny_world())
-    td = env.step_mdp(env.rand_step(env.reset(random_start(2))))
-    latent = td["latent"].clone()
-    again = env.reset(td)
-    assert again["latent"].equal(latent)
-    for key in ("past_length", "past_latent", "past_action"):
-        assert not again[key].any()
 
 
 @pytest.mark.parametrize(
@@ -245,7 +233,7 @@ def test_starts_that_do_not_fit_are_refused(tiny_world, start, message):
 
 
 def test_a_start_is_needed(tiny_world):
-    """There is no latent to start from by default, and a planner wants a tensordict that went through reset."""
+    """There is no default latent to start from, and a planner needs a tensordict from reset."""
     env = LatentGoalEnv(tiny_world())
     with pytest.raises(KeyError, match=r"\['latent', 'goal_latent'\] missing: encode a frame"):
         env.reset()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import get_type_hints
+
 import pytest
 import torch
+from making import make_planner
 from tensordict import TensorDict
-from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from torchrl_ficreg import (
@@ -13,30 +16,25 @@ from torchrl_ficreg import (
     GoalDistance,
     GoalPolicy,
     InverseConsistency,
-    LatentCEMPlanner,
     LatentPlanner,
     make_world_model,
     ModelConfig,
     MPCPolicy,
     PlanConfig,
+    protocols,
 )
 from torchrl_ficreg.envs import make_env
 from torchrl_ficreg.planners import SEARCHES
 
-pytestmark = pytest.mark.usefixtures("fast_bf16")
-
-SIZES = {"num_candidates": 8, "num_elites": 2, "iterations": 2, "horizon": 3, "precision": "fp32"}
-UNIT = ([-1.0, -1.0], [1.0, 1.0])
-
 
 class Counted(LatentPlanner):
-    """Plans 0, 1, 2, ... in units of 0.001, plus the first latent, and notes for which environments."""
+    """Plans 0, 1, 2, ... in units of 0.001, plus the first latent, and records for which environments."""
 
-    asked: list[float]
+    planned: list[float]
 
     def _search(self, problem):
         latent = problem.latent  # [e, 1, D]
-        self.__dict__.setdefault("asked", []).extend(latent[:, 0, 0].tolist())
+        self.__dict__.setdefault("planned", []).extend(latent[:, 0, 0].tolist())
         block = self.world_model.block_dim
         plan = torch.arange(self.config.horizon * block).view(1, self.config.horizon, block) * 0.001 + latent[:, :, :1]
         return TensorDict({"plan": plan, "plan_cost": latent[:, 0, 0]}, [len(latent)])
@@ -50,7 +48,7 @@ def scene(*corner):
 
 
 def counted(world, receding_horizon=2):
-    return Counted(world, PlanConfig(**SIZES, receding_horizon=receding_horizon, bounds="none"))
+    return Counted(world, PlanConfig(horizon=3, receding_horizon=receding_horizon, bounds="none", precision="fp32"))
 
 
 def test_a_block_is_served_action_by_action_in_environment_units(linear_world):
@@ -65,7 +63,7 @@ def test_a_block_is_served_action_by_action_in_environment_units(linear_world):
     expected = (torch.arange(12).view(6, 2) * 0.001 + 7) * torch.tensor([1.0, 2.0]) + torch.tensor([10.0, 20.0])
     torch.testing.assert_close(torch.stack(served[:6]), expected)
     torch.testing.assert_close(torch.stack(served[6:]), expected[:2])
-    assert planner.asked == [7.0, 7.0]
+    assert planner.planned == [7.0, 7.0]
 
 
 @pytest.mark.parametrize("receding_horizon", [1, 2, 3])
@@ -76,18 +74,18 @@ def test_a_plan_is_made_every_receding_horizon_blocks(linear_world, receding_hor
         td = policy(td)
         counts.append(td["mpc", "count"].tolist())
     assert counts == [[1 + step // (2 * receding_horizon)] * 2 for step in range(12)]
-    assert len(planner.asked) == 2 * counts[-1][0]
+    assert len(planner.planned) == 2 * counts[-1][0]
 
 
 def test_a_reset_environment_is_planned_for_alone(linear_world):
     planner = counted(linear_world(2))
     policy, td = MPCPolicy(planner), scene(1, 2, 3)
     td = policy(policy(td))
-    planner.asked.clear()
+    planner.planned.clear()
     td["is_init"] = torch.tensor([[False], [True], [False]])
     td["pixels"][1, 0, 0, 0] = 50
     td = policy(td)
-    assert planner.asked == [50.0]
+    assert planner.planned == [50.0]
     assert td["mpc", "count"].tolist() == [1, 1, 1]
     assert td["mpc", "cursor"].tolist() == [3, 1, 3]
     torch.testing.assert_close(td["action"][:, 0], torch.tensor([1.004, 50.0, 3.004]))
@@ -99,15 +97,12 @@ def test_a_reset_environment_is_planned_for_alone(linear_world):
 def test_a_policy_cast_as_a_whole_plans_in_its_dtype(dtype, search, fast_bf16):
     """Queue and plan follow the model's dtype, through several plans; the cost stays a float32.
 
-    Whatever is called in between is cast with it: the predictor, a goal policy that proposes, a judge in the cost.
+    The predictor, the goal policy and the inverse model of the cost are cast with it.
     """
-    planner_class = SEARCHES[search]
     model, inverse = make_world_model(ModelConfig.preset("cpu", latent_dim=4, history=2), action_dim=2)
-    config = planner_class.config_class(num_candidates=4, num_elites=2, iterations=1, horizon=2, receding_horizon=1)
+    small = {"num_candidates": 4, "num_elites": 2, "iterations": 1, "horizon": 2, "precision": "auto"}
     cost = CostSum([GoalDistance(), InverseConsistency(inverse.eval())], [1.0, 0.5], scale_free=True)
-    planner = planner_class(
-        model.eval(), config, action_bounds=UNIT, cost=cost, policy=GoalPolicy(latent_dim=4, action_dim=10)
-    )
+    planner = make_planner(search, model.eval(), cost=cost, policy=GoalPolicy(latent_dim=4, action_dim=10), **small)
     policy = MPCPolicy(planner).to(dtype)
     frame = torch.zeros(2, 3, 64, 64, dtype=torch.uint8)
     td = TensorDict({"pixels": frame, "goal_pixels": frame}, [2])
@@ -118,7 +113,7 @@ def test_a_policy_cast_as_a_whole_plans_in_its_dtype(dtype, search, fast_bf16):
 
 
 def test_its_memory_is_in_the_tensordict_alone(linear_world):
-    """Two rollouts interleaved through one policy do not mix, and yesterday's tensordict is not written to."""
+    """Two rollouts interleaved through one policy do not mix, and an earlier tensordict is not written to."""
     policy = MPCPolicy(counted(linear_world(2)))
     first, second = policy(scene(1)), policy(scene(2))
     kept = first.clone()
@@ -141,6 +136,22 @@ def test_other_keys_are_left_alone(linear_world):
     assert (td.select(*before.keys()) == before).all()
 
 
+def test_a_planner_needs_no_more_than_its_protocol(linear_world):
+    world, config = linear_world(), PlanConfig(horizon=2, receding_horizon=1)
+
+    def plan(latent, goal, seeds=None, *, past_action=None, initial=None):
+        block = world.statistics.normalize(torch.tensor([0.5, -0.5])).repeat(world.frame_skip)
+        return TensorDict({"plan": block.expand(*initial.shape), "plan_cost": torch.zeros(len(latent))}, [len(latent)])
+
+    own = {"world_model": world, "config": config, "context": 1, "action_bounds": None, "plan": plan}
+    assert own.keys() == get_type_hints(protocols.Planner).keys() | {"plan"}
+    pixels = torch.zeros(3, 3, 8, 8, dtype=torch.uint8)
+    td = TensorDict({"pixels": pixels, "goal_pixels": pixels}, [3])
+    torch.testing.assert_close(MPCPolicy(SimpleNamespace(**own))(td)["action"], torch.tensor([[0.5, -0.5]]).expand(3, 2))
+    with pytest.raises(ValueError, match=r"takes batches \[E\] or \[\], got \[1, 3\]"):
+        MPCPolicy(SimpleNamespace(**own))(td.unsqueeze(0))
+
+
 def test_an_environment_without_batch_dimension_is_served(linear_world):
     policy = MPCPolicy(counted(linear_world(2)))
     td, batched = scene(7)[0], scene(7)
@@ -155,8 +166,8 @@ def test_actions_never_leave_the_bounds_of_the_environment(linear_world):
     """Not by rounding either, however the statistics are: goals far away in every direction."""
     low, high = torch.tensor([-0.1, -7.3]), torch.tensor([0.3, -0.7])
     world = linear_world(2, mean=(0.13, -3.1), std=(0.17, 2.9))
-    config = PlanConfig(num_candidates=200, num_elites=20, iterations=20, horizon=3, receding_horizon=3)
-    policy = MPCPolicy(LatentCEMPlanner(world, config, action_bounds=(low, high)))
+    search = {"num_candidates": 200, "num_elites": 20, "iterations": 20, "receding_horizon": 3}
+    policy = MPCPolicy(make_planner("cem", world, action_bounds=(low, high), **search))
     td = scene(0, 0, 255, 255)
     td["pixels"][:, 0, 0, 1] = torch.tensor([0, 255, 0, 255], dtype=torch.uint8)
     td["goal_pixels"] = 255 - td["pixels"]
@@ -170,28 +181,11 @@ def test_actions_never_leave_the_bounds_of_the_environment(linear_world):
     torch.testing.assert_close(served.mean(0), torch.where(away > 0, high, low), rtol=0.05, atol=0.02)
 
 
-def test_a_plan_depends_on_its_seed_and_its_number_not_on_company(tiny_world):
-    """Served among four, with others reset at other times, an environment acts as it does alone."""
-    config = PlanConfig(**SIZES, receding_horizon=1)
-    policy = MPCPolicy(LatentCEMPlanner(tiny_world(), config, action_bounds=UNIT))
-    pixels, goal = torch.randint(0, 256, (2, 4, 3, 16, 16), dtype=torch.uint8)
-    td = TensorDict({"pixels": pixels, "goal_pixels": goal, "plan_seed": torch.tensor([8, 3, 5, 1])}, [4])
-    alone, together = td[2:3].clone(), td.clone()
-    actions = []
-    for step in range(6):
-        alone = policy(alone)
-        together["is_init"] = torch.tensor([[step == 3], [step == 1], [False], [step == 2]])
-        together = policy(together)
-        assert alone["action"].equal(together["action"][2:3])
-        actions.append(alone["action"])
-    assert not actions[0].equal(actions[2])  # a later plan draws other numbers
-
-
 @pytest.mark.parametrize("num_envs", [1, 2])
 def test_it_drives_a_torchrl_environment(tiny_world, num_envs):
     """One plan per block of two steps in a plain env.rollout, through whatever becomes of the tensordict in between."""
     env = make_env("two_room", num_envs, image_size=16, seed=0)
-    policy = MPCPolicy(LatentCEMPlanner(tiny_world(), PlanConfig(**SIZES, receding_horizon=1), action_bounds=UNIT))
+    policy = MPCPolicy(make_planner("cem", tiny_world()))
     td = env.rollout(7, policy, break_when_any_done=False)
     counts = td["mpc", "count"].reshape(num_envs, 7)
     assert counts.tolist() == [[1, 1, 2, 2, 3, 3, 4]] * num_envs
@@ -200,16 +194,8 @@ def test_it_drives_a_torchrl_environment(tiny_world, num_envs):
     assert (moved != 0).any()
 
 
-def test_environments_that_start_anew_are_planned_for_anew(tiny_world):
-    """TorchRL's InitTracker says when: episodes of three steps, blocks of two."""
-    env = TransformedEnv(make_env("two_room", 2, image_size=16, seed=0, max_episode_steps=3), InitTracker())
-    policy = MPCPolicy(LatentCEMPlanner(tiny_world(), PlanConfig(**SIZES, receding_horizon=1), action_bounds=UNIT))
-    td = env.rollout(7, policy, break_when_any_done=False)
-    assert td["mpc", "count"].tolist() == [[1, 1, 2, 1, 1, 2, 1]] * 2
-
-
 def test_stepping_by_hand_is_the_same_as_a_rollout(tiny_world):
-    policy = MPCPolicy(LatentCEMPlanner(tiny_world(), PlanConfig(**SIZES, receding_horizon=1), action_bounds=UNIT))
+    policy = MPCPolicy(make_planner("cem", tiny_world()))
     expected = make_env("two_room", 2, image_size=16, seed=0).rollout(5, policy, break_when_any_done=False)["action"]
     env = make_env("two_room", 2, image_size=16, seed=0)
     td, actions = env.reset(), []

@@ -1,20 +1,22 @@
-"""Search for action sequences in latent space: dynamics x cost x search."""
+"""Planning in latent space: dynamics, cost and search; and model-predictive control with the plans."""
 
 from __future__ import annotations
 
 from torchrl_ficreg.planners.base import LatentPlanner
-from torchrl_ficreg.planners.config import GradientConfig, ICEMConfig, MPPIConfig, PlanConfig
+from torchrl_ficreg.planners.cem import CEMConfig, LatentCEMPlanner, SamplingPlanner
+from torchrl_ficreg.planners.config import PlanConfig
 from torchrl_ficreg.planners.costs import ActionEffort, CostSum, GoalDistance, InverseConsistency, PathDistance
-from torchrl_ficreg.planners.goal_policy import PolicyPlanner
-from torchrl_ficreg.planners.gradient import GradientPlanner
+from torchrl_ficreg.planners.goal_policy import GoalPolicyPlanner
+from torchrl_ficreg.planners.gradient import GradientConfig, GradientPlanner
 from torchrl_ficreg.planners.latent_env import LatentGoalEnv
 from torchrl_ficreg.planners.mpc import MPCPolicy
 from torchrl_ficreg.planners.sampling import (
-    LatentCEMPlanner,
+    ICEMConfig,
     LatentICEMPlanner,
     LatentMPPIPlanner,
+    MPPIConfig,
     RandomShooting,
-    SamplingPlanner,
+    ShootingConfig,
 )
 
 SEARCHES: dict[str, type[LatentPlanner]] = {
@@ -23,13 +25,15 @@ SEARCHES: dict[str, type[LatentPlanner]] = {
     "mppi": LatentMPPIPlanner,
     "gradient": GradientPlanner,
     "shooting": RandomShooting,
-    "policy": PolicyPlanner,
-}
+    "policy": GoalPolicyPlanner,
+}  # by their names in the scripts' configuration
 
 __all__ = [
     "ActionEffort",
+    "CEMConfig",
     "CostSum",
     "GoalDistance",
+    "GoalPolicyPlanner",
     "GradientConfig",
     "GradientPlanner",
     "ICEMConfig",
@@ -43,8 +47,8 @@ __all__ = [
     "MPPIConfig",
     "PathDistance",
     "PlanConfig",
-    "PolicyPlanner",
     "RandomShooting",
-    "SamplingPlanner",
     "SEARCHES",
+    "SamplingPlanner",
+    "ShootingConfig",
 ]

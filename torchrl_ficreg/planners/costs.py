@@ -1,9 +1,11 @@
-"""Costs of imagined trajectories, [E, K, T, D] x [E, D] -> [E, K]; lower is better.
+"""Costs of imagined trajectories; lower is better.
 
-E environments, K candidates, T imagined blocks. A cost is any module called as ``cost(predicted, goal)``; one that also
-wants the candidates' action blocks [E, K, T, F * A] or the latents they start from [E, D] names them ``action`` and
-``start`` in its ``forward``. The goal's distance is measured in squared latent units, an action's effort in squared
-z-scores; :class:`CostSum` can make one independent of the other's scale.
+A cost is a module or a function ``cost(predicted, goal, *, action, start)`` -> [E, K] for E environments with K candidates of T
+action blocks: predicted latents [E, K, T, D], goal latents [E, D], the candidates' z-scored action blocks [E, K, T, F * A] and
+the latents they start from [E, D]. It may leave out the keyword arguments that it does not use.
+
+:class:`GoalDistance` and :class:`PathDistance` are in squared latent units, :class:`ActionEffort` and
+:class:`InverseConsistency` in squared z-scores; :class:`CostSum` adds them up, independent of their scales if asked.
 """
 
 from __future__ import annotations
@@ -15,25 +17,10 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torchrl_ficreg.keys import LATENT, RECOVERED_ACTION
-from torchrl_ficreg.modules.feed import arrange, feed, NEXT_LATENT, read_output, require_module
+from torchrl_ficreg.keys import LATENT, NEXT_LATENT, RECOVERED_ACTION
+from torchrl_ficreg.modules.feed import arrange, feed, read_output, require_module
 
 Cost = Callable[..., torch.Tensor]
-
-
-def wanted_by(cost: Cost) -> tuple[str, ...]:
-    """Which of ``action`` and ``start`` a cost names.
-
-    Raises:
-        TypeError: it cannot be called, or is a class in place of an instance of it.
-    """
-    if isinstance(cost, type) or not callable(cost):
-        raise TypeError(
-            f"a cost is a module or function (predicted, goal) -> [E, K], such as GoalDistance(), got {cost!r}."
-        )
-    parameters = inspect.signature(cost.forward if isinstance(cost, nn.Module) else cost).parameters
-    takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-    return tuple(name for name in ("action", "start") if takes_all or name in parameters)
 
 
 class GoalDistance(nn.Module):
@@ -54,11 +41,15 @@ class PathDistance(nn.Module):
     """Squared distance from the goal, averaged over the whole path: a plan that arrives early is cheaper.
 
     Args:
-        discount: weight of each imagined block relative to the one after it; below 1 the end counts more.
+        discount (float, optional): weight of each imagined block relative to the next one; below 1 the end has more weight.
+            Default: ``1.0``.
+
+    Raises:
+        ValueError: ``discount`` is not in (0, 1].
 
     Examples:
         >>> import torch
-        >>> path = torch.tensor([[[[2.0], [0.0]], [[0.0], [2.0]]]])  # there late, there early: [1, 2, 2, 1]
+        >>> path = torch.tensor([[[[2.0], [0.0]], [[0.0], [2.0]]]])  # arrives late, arrives early: [1, 2, 2, 1]
         >>> PathDistance()(path, torch.zeros(1, 1)), PathDistance(discount=0.5)(path, torch.zeros(1, 1))
         (tensor([[2., 2.]]), tensor([[1.3333, 2.6667]]))
     """
@@ -78,7 +69,7 @@ class PathDistance(nn.Module):
 
 
 class ActionEffort(nn.Module):
-    """Mean squared z-scored action: among plans that end equally well, the least unusual one.
+    """Mean squared z-scored action: among plans that end equally well, those closest to the mean action are cheaper.
 
     Examples:
         >>> import torch
@@ -87,21 +78,26 @@ class ActionEffort(nn.Module):
     """
 
     def forward(self, predicted: torch.Tensor, goal: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Action blocks [E, K, T, F * A] -> [E, K]; the latents are not looked at."""
+        """Action blocks [E, K, T, F * A] -> [E, K]; the latents are not used."""
         return action.square().mean((-1, -2))
 
 
 class InverseConsistency(nn.Module):
-    """The trained judge scores each imagined step: would it recover the action that was imagined? (arXiv 2607.02403)
+    """Error of the inverse dynamics model on the imagined transitions (arXiv 2607.02403).
 
     The mean squared error, in z-scores, between a candidate's action blocks and those that the inverse dynamics model
-    recovers from its imagined latents. Where a search leaves what the predictor has learnt, imagined transitions stop
-    looking like consequences of their actions, and this cost rises. Add it to a distance by a scale-free
-    :class:`CostSum`. A model with a ``history`` H, such as the transformer, judges every step from the last H latents.
+    recovers from its imagined latents. It rises where a search leaves the training distribution of the predictor. Add it to a
+    distance with a scale-free :class:`CostSum`. A model with a ``history`` H, such as the transformer, recovers every action
+    from the last H latents.
 
     Args:
-        inverse_model: reads two latents, by name as in :class:`~torchrl_ficreg.FICRegLoss`, writes the recovered action
-            block; see :class:`~torchrl_ficreg.InverseDynamicsModel`. Keep it in ``eval()``.
+        inverse_model (TensorDictModule): reads two latents, by name as in :class:`~torchrl_ficreg.FICRegLoss`, and writes the
+            recovered action block [..., F * A], z-scored; see :class:`~torchrl_ficreg.InverseDynamicsModel`. In ``eval()``
+            mode.
+
+    Raises:
+        TypeError: ``inverse_model`` is no TensorDictModule.
+        ValueError: its keys do not say which latent is which.
 
     Examples:
         >>> import torch
@@ -123,38 +119,39 @@ class InverseConsistency(nn.Module):
         """[E, K, T, D], [E, D], [E, K, T, F * A] and [E, D] -> [E, K]."""
         first = start[:, None, None].expand(-1, predicted.shape[1], 1, -1)  # [E, K, 1, D]
         before = torch.cat([first, predicted[:, :, :-1]], dim=2)  # [E, K, T, D]
-        history = getattr(getattr(self.inverse_model, "module", self.inverse_model), "history", None)
+        history = getattr(self.inverse_model, "history", None)
         if history is None or before.shape[2] <= history:
             recovered = self._recover(before, predicted)  # [E, K, T, F * A]
-        else:  # every window of H latents at once: the first tells its H actions, each later one its last
+        else:  # all windows of H latents in one batch: H actions from the first, the last action from the others
             windows = (latent.unfold(2, history, 1).transpose(-1, -2) for latent in (before, predicted))
-            found = self._recover(*windows)  # [E, K, T - H + 1, H, F * A]
-            recovered = torch.cat([found[:, :, 0], found[:, :, 1:, -1]], dim=2)
+            actions = self._recover(*windows)  # [E, K, T - H + 1, H, F * A]
+            recovered = torch.cat([actions[:, :, 0], actions[:, :, 1:, -1]], dim=2)
         return (recovered - action).square().mean((-1, -2))
 
     def _recover(self, latent: torch.Tensor, next_latent: torch.Tensor) -> torch.Tensor:
-        """Action blocks that the model recovers from latents in whatever dtype; its own, if it was cast."""
+        """Recovered action blocks, computed in the dtype of the inverse model and returned in that of the latents."""
         dtype = next((p.dtype for p in self.inverse_model.parameters()), latent.dtype)
         inputs = {LATENT: latent.to(dtype), NEXT_LATENT: next_latent.to(dtype)}
-        judged = self.inverse_model(feed("inverse_model", self.inverse_model, inputs))
-        return read_output(self.inverse_model, judged, RECOVERED_ACTION, 0).to(latent.dtype)
+        written = self.inverse_model(feed("inverse_model", self.inverse_model, inputs))
+        return read_output(self.inverse_model, written, RECOVERED_ACTION).to(latent.dtype)
 
 
 class CostSum(nn.Module):
     """Weighted sum of costs.
 
-    With ``scale_free`` every term but the first is first scaled so that its standard deviation over the K candidates
-    of an environment equals that of the first term. A weight of 0.5 then says "half as decisive as the first term"
-    whatever units either has, in every environment and every iteration (arXiv 2607.02403). A plan on its own has no
-    spread: its cost is that of the first term alone, by its weight.
+    With ``scale_free`` every term but the first is scaled so that its standard deviation over the K candidates of an
+    environment equals that of the first term. A weight of 0.5 then means half the influence of the first term, whatever the
+    units, in every environment and every iteration (arXiv 2607.02403). Over a single candidate the standard deviation is zero:
+    its cost is the weighted first term alone.
 
     Args:
-        terms: costs; see the module.
-        weights: one number for each.
-        scale_free: see above.
+        terms (sequence of nn.Module): costs; see the module.
+        weights (sequence of float): one for each term.
+        scale_free (bool, optional): see above. Default: ``False``.
 
     Raises:
-        ValueError: no terms, or another number of weights.
+        ValueError: no terms, or another number of weights. When called: a term that is not [E, K].
+        TypeError: a term that is no module.
 
     Examples:
         >>> import torch
@@ -171,21 +168,61 @@ class CostSum(nn.Module):
                 f"{len(terms)} terms and {len(weights)} weights."
             )
         self.terms, self.weights, self.scale_free = nn.ModuleList(terms), tuple(weights), scale_free
-        self.wanted = [wanted_by(term) for term in terms]
+        self._keywords = [keywords_of(term) for term in terms]
 
     def forward(
         self, predicted: torch.Tensor, goal: torch.Tensor, action: torch.Tensor, start: torch.Tensor
     ) -> torch.Tensor:
         """[E, K, T, D], [E, D], [E, K, T, F * A] and [E, D] -> [E, K]."""
-        extra = {"action": action, "start": start}
         values = [
-            term(predicted, goal, **{name: extra[name] for name in names})
-            for term, names in zip(self.terms, self.wanted)
+            call_cost(term, keywords, predicted, goal, action=action, start=start)
+            for term, keywords in zip(self.terms, self._keywords)
         ]  # each [E, K]
         if self.scale_free:
-            spreads = [value.detach().std(1, unbiased=False, keepdim=True) for value in values]  # each [E, 1]
-            values[1:] = [
-                value * torch.where(spread > 0, spreads[0] / spread, 0.0)
-                for value, spread in zip(values[1:], spreads[1:])
-            ]
+            first, *others = (value.detach().std(1, unbiased=False, keepdim=True) for value in values)  # each [E, 1]
+            values[1:] = [value * torch.where(std > 0, first / std, 0.0) for value, std in zip(values[1:], others)]
         return torch.stack([weight * value for weight, value in zip(self.weights, values)]).sum(0)
+
+
+def keywords_of(cost: Cost) -> tuple[str, ...]:
+    """Which of ``action`` and ``start`` a cost takes.
+
+    Raises:
+        TypeError: it cannot be called, or is a class in place of an instance of it.
+    """
+    if isinstance(cost, type) or not callable(cost):
+        raise TypeError(
+            f"a cost is a module or function (predicted, goal) -> [E, K], such as GoalDistance(), got {cost!r}."
+        )
+    cost = getattr(cost, "_orig_mod", cost)  # of torch.compile, whose own signature takes everything
+    try:
+        parameters = inspect.signature(cost.forward if isinstance(cost, nn.Module) else cost).parameters
+    except ValueError:  # a ScriptFunction, for example, has no signature
+        return ()
+    takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    return tuple(name for name in ("action", "start") if takes_all or name in parameters)
+
+
+def call_cost(
+    cost: Cost,
+    keywords: Sequence[str],
+    predicted: torch.Tensor,
+    goal: torch.Tensor,
+    *,
+    action: torch.Tensor,
+    start: torch.Tensor,
+) -> torch.Tensor:
+    """Calls a cost with those of ``action`` and ``start`` that are in ``keywords``; see the module for the shapes.
+
+    Raises:
+        ValueError: the result has another shape than [E, K].
+    """
+    given = {"action": action, "start": start}
+    value = cost(predicted, goal, **{name: given[name] for name in keywords})
+    shape = value.shape if isinstance(value, torch.Tensor) else type(value).__name__
+    if shape != predicted.shape[:2]:
+        raise ValueError(
+            f"a cost maps predictions {list(predicted.shape)} and goals {list(goal.shape)} to [E, K] = "
+            f"{list(predicted.shape[:2])}, {type(cost).__name__} returned {shape if isinstance(shape, str) else list(shape)}."
+        )
+    return value

@@ -1,26 +1,29 @@
-"""No search at all: the goal-conditioned policy's own plan."""
+"""Planner that returns the action sequence of a goal-conditioned policy; no search."""
 
 from __future__ import annotations
 
 from tensordict import TensorDict
 
-from torchrl_ficreg.planners.base import LatentPlanner, PLAN, PLAN_COST
-from torchrl_ficreg.planners.problem import Problem
+from torchrl_ficreg.keys import PLAN, PLAN_COST
+from torchrl_ficreg.planners.base import LatentPlanner, Problem
 
 
-class PolicyPlanner(LatentPlanner):
-    """Does what a goal-conditioned policy says (arXiv 2605.08732): one look instead of thousands of rollouts.
+class GoalPolicyPlanner(LatentPlanner):
+    """Returns what a goal-conditioned policy does (arXiv 2605.08732): one forward pass per block instead of a search.
 
-    Blocks beyond the first are imagined: policy and world model in turns. With ``receding_horizon=1`` every block
-    follows a look at a real frame. See :class:`~torchrl_ficreg.LatentPlanner` for what is read and written; ``policy``
-    is needed here.
+    Blocks beyond the first are imagined: policy and world model alternate. With ``receding_horizon=1`` the policy acts on real
+    frames only. See :class:`~torchrl_ficreg.LatentPlanner` for the entries that are read and written; ``policy`` is required,
+    and the settings are a :class:`~torchrl_ficreg.PlanConfig`. The scripts call this planner ``plan=policy``.
+
+    Raises:
+        ValueError: no policy, or ``num_proposals`` of 0.
 
     Examples:
         >>> import torch
-        >>> from torchrl_ficreg import GoalPolicy, ModelConfig, PlanConfig, PolicyPlanner, make_world_model
+        >>> from torchrl_ficreg import GoalPolicy, GoalPolicyPlanner, ModelConfig, PlanConfig, make_world_model
         >>> model, _ = make_world_model(ModelConfig.preset("cpu", latent_dim=4), action_dim=2)
         >>> config, policy = PlanConfig(horizon=1, receding_horizon=1), GoalPolicy(latent_dim=4, action_dim=10)
-        >>> planner = PolicyPlanner(model.eval(), config, action_bounds=([-1, -1], [1, 1]), policy=policy)
+        >>> planner = GoalPolicyPlanner(model.eval(), config, action_bounds=([-1, -1], [1, 1]), policy=policy)
         >>> planner.plan(torch.zeros(3, 4), torch.ones(3, 4))["plan"].shape
         torch.Size([3, 1, 10])
     """
@@ -28,10 +31,7 @@ class PolicyPlanner(LatentPlanner):
     def __init__(self, *args, **kwargs) -> None:
         super().__init__(*args, **kwargs)
         if self.policy is None or not self.config.num_proposals:
-            raise ValueError("PolicyPlanner needs a policy=, see train_policy.py, and num_proposals above 0.")
-
-    def _candidates(self) -> int:
-        return 1
+            raise ValueError("GoalPolicyPlanner needs a policy=, see train_policy.py, and num_proposals above 0.")
 
     def _search(self, problem: Problem) -> TensorDict:
         plan = problem.proposals[:, 0]  # [e, horizon, F * A]

@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from tensordict import TensorDict
 
-from torchrl_ficreg.planners.base import LatentPlanner, PLAN, PLAN_COST, TRACE
-from torchrl_ficreg.planners.config import GradientConfig
-from torchrl_ficreg.planners.problem import Problem
+from torchrl_ficreg.keys import PLAN, PLAN_COST, TRACE
+from torchrl_ficreg.planners.base import LatentPlanner, Problem
+from torchrl_ficreg.planners.config import PlanConfig
+
+
+@dataclass(frozen=True)
+class GradientConfig(PlanConfig):
+    """Settings of the gradient planner.
+
+    Raises:
+        ValueError: a value of another type or outside its range.
+    """
+
+    num_candidates: int = 16  # action sequences optimised side by side, at least 2
+    iterations: int = 30  # steps of Adam
+    std: float = 1.0  # of the action sequences at the start, in z-scored actions
+    learning_rate: float = 0.1  # of Adam, in z-scored actions
 
 
 class GradientPlanner(LatentPlanner):
-    """Descends the imagined cost by Adam, from several random action sequences at once; the best one is the plan.
+    """Minimises the imagined cost with Adam, from several random action sequences side by side; the best one is the plan.
 
-    Every step is followed by a projection into the bounds. Costs of latent world models are full of local minima:
-    expect less than from the cross-entropy method. See :class:`~torchrl_ficreg.LatentPlanner` for what is read and
-    written; the trace's ``elite_cost`` and ``spread`` are those of all candidates.
+    Every step is followed by a projection into the bounds. Costs of latent world models have many local minima: expect less
+    than from the cross-entropy method. See :class:`~torchrl_ficreg.LatentPlanner` for the entries that are read and written;
+    ``elite_cost`` and ``std`` of the trace are those of all candidates.
 
     Examples:
         >>> import torch
@@ -43,8 +59,8 @@ class GradientPlanner(LatentPlanner):
                 cost = problem.cost(candidates)  # [e, K]
                 if not cost.requires_grad:
                     raise ValueError(
-                        "the cost has no gradient with respect to the actions, without which there is nothing to descend: "
-                        "remove what detaches it in the predictor or the cost, or search with LatentCEMPlanner."
+                        "the cost has no gradient with respect to the actions, which GradientPlanner needs: remove what "
+                        "detaches it in the predictor or the cost, or use LatentCEMPlanner."
                     )
                 (candidates.grad,) = torch.autograd.grad(cost.sum(), candidates)
             trace.append((cost.detach().amin(1), cost.detach().mean(1), candidates.detach().std(1).mean((-1, -2))))
@@ -55,7 +71,7 @@ class GradientPlanner(LatentPlanner):
         plan = candidates[torch.arange(len(best), device=best.device), best]  # [e, H, F * A]
         result = {PLAN: plan, PLAN_COST: problem.cost(plan.unsqueeze(1))[:, 0]}
         if config.trace:
-            names = ("best_cost", "elite_cost", "spread")
+            names = ("best_cost", "elite_cost", "std")
             columns = (torch.stack(column, dim=1).detach() for column in zip(*trace))
             result[TRACE] = TensorDict(dict(zip(names, columns)), [len(best)])
         return TensorDict(result, [len(best)]).detach()

@@ -1,86 +1,125 @@
-"""Model-predictive control: one raw action per environment step, a new plan every few blocks."""
+"""Model-predictive control: one raw action per environment step, a new plan every few action blocks."""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 
-from torchrl_ficreg.keys import ACTION, GOAL_PIXELS, PIXELS
+from torchrl_ficreg.keys import (
+    ACTION,
+    GOAL_PIXELS,
+    IS_INIT,
+    MPC_MEMORY,
+    PAST_ACTION,
+    PAST_LATENT,
+    PIXELS,
+    PLAN,
+    PLAN_COST,
+    PLAN_SEED,
+)
 from torchrl_ficreg.modules.feed import require_tensordict
-from torchrl_ficreg.planners.base import LatentPlanner, PAST_ACTION, PLAN, PLAN_COST, PLAN_SEED
+from torchrl_ficreg.planners.base import LatentPlanner, mix_seeds
+from torchrl_ficreg.planners.keyed import KeyedMixin
 
 
-class MPCPolicy(TensorDictModuleBase):
-    """Serves one raw action per environment step; plans again after every ``receding_horizon`` blocks.
+class MPCPolicy(KeyedMixin, TensorDictModuleBase):
+    """Executes plans action by action and plans again after every ``receding_horizon`` blocks.
 
-    Its memory travels in the tensordict, under ``"mpc"``: the raw actions still to be executed, how many were, how
-    often was planned, the plan in force and the cost predicted for it. For a predictor that sees several frames it also
-    holds the latents of the last real ones and the blocks executed between them; planning starts from as many as there
-    are, from one frame on, and none is ever made up. Environments are independent: those that are fresh
-    (no memory yet, or ``is_init`` true) or whose queue is used up are planned for, the others are left alone. Where
-    environments reset themselves, append TorchRL's ``InitTracker``, which writes ``is_init``: without it the old
-    episode's actions go on.
-    ``plan_seed`` [E] int64 names each environment's random draws (0, 1, ... when absent), so a plan depends neither on
-    who else is planned for nor on when.
+    Reads ``pixels`` and ``goal_pixels`` [E, 3, H, W], and where they are present ``is_init`` [E, 1] bool and ``plan_seed`` [E]
+    int64. Writes ``action`` [E, A] in environment units and its memory as ``mpc``. All keys can be changed with
+    :meth:`set_keys`.
 
-    Reads ``pixels`` and ``goal_pixels`` [E, 3, H, W], writes ``action`` [E, A] in environment units.
+    The memory travels in the tensordict, so that one policy can serve several rollouts. It is a tensordict with:
+
+    * ``queue`` [E, receding_horizon * F, A]: the raw actions of the plan, and ``cursor`` [E]: how many were executed;
+    * ``count`` [E]: plans so far in the episode;
+    * ``plan`` [E, horizon, F * A] and ``plan_cost`` [E]: the last plan, z-scored, and its predicted cost;
+    * ``past_latent`` [E, C - 1, D], ``past_action`` [E, C - 1, F * A] and ``past_count`` [E]: for a predictor with a history, the
+      last latents of real frames, the blocks executed after each, and how many of them are filled.
+
+    Environments without memory, with ``is_init`` true or with an empty queue are planned for; the others are left as they are.
+    Where environments reset themselves, append TorchRL's ``InitTracker``, which writes ``is_init``. Otherwise the actions of the
+    old episode continue. ``plan_seed`` identifies the random draws of each environment, 0, 1, ... when absent: a plan depends on
+    this number and on how many plans came before it in the episode, not on the other environments.
 
     Args:
-        planner: the search; its world model encodes the frames.
+        planner (LatentPlanner): makes the plans; its world model encodes the frames.
+
+    Raises:
+        TypeError: when called with something else than a tensordict.
+        ValueError: when called with a tensordict of more than one batch dimension.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_ficreg import LatentCEMPlanner, ModelConfig, MPCPolicy, PlanConfig, make_world_model
+        >>> from torchrl_ficreg import CEMConfig, LatentCEMPlanner, ModelConfig, MPCPolicy, make_world_model
         >>> model, _ = make_world_model(ModelConfig.preset("cpu"), action_dim=2)
-        >>> config = PlanConfig(num_candidates=8, num_elites=2, iterations=1)
+        >>> config = CEMConfig(num_candidates=8, num_elites=2, iterations=1)
         >>> policy = MPCPolicy(LatentCEMPlanner(model.eval(), config, action_bounds=([-1, -1], [1, 1])))
         >>> frame = torch.zeros(2, 3, 64, 64, dtype=torch.uint8)
         >>> policy(TensorDict({"pixels": frame, "goal_pixels": frame}, [2]))["action"].shape
         torch.Size([2, 2])
+        >>> policy.set_keys(pixels=("camera", "rgb"), memory=("agent", "mpc"))
+        >>> policy.in_keys, policy.out_keys
+        ([('camera', 'rgb'), 'goal_pixels'], ['action', ('agent', 'mpc')])
     """
+
+    @dataclass(frozen=True)
+    class _AcceptedKeys:
+        pixels: NestedKey = PIXELS
+        goal_pixels: NestedKey = GOAL_PIXELS
+        action: NestedKey = ACTION
+        is_init: NestedKey = IS_INIT
+        plan_seed: NestedKey = PLAN_SEED
+        memory: NestedKey = MPC_MEMORY
 
     def __init__(self, planner: LatentPlanner) -> None:
         super().__init__()
         self.planner = planner
-        self.in_keys, self.out_keys = [PIXELS, GOAL_PIXELS], [ACTION, "mpc"]
+        self.set_keys()
+
+    def _apply_keys(self) -> None:
+        keys = self.tensor_keys
+        self.in_keys, self.out_keys = [keys.pixels, keys.goal_pixels], [keys.action, keys.memory]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """See the class."""
+        """Writes one raw action per environment, after planning where a plan is due; see the class."""
         require_tensordict("MPCPolicy", tensordict)
-        td = tensordict if tensordict.ndim else tensordict.unsqueeze(0)
-        memory = self._memory(td)
-        used_up = memory["cursor"] >= memory["queue"].shape[1]  # [E]
-        remembers = self.planner.context > 1
-        looks = memory["cursor"] % self.planner.world_model.frame_skip == 0 if remembers else used_up  # [E]
-        if looks.any():
-            latent = self._encode(td[PIXELS], looks)  # [E, D], zeros elsewhere
-            if used_up.any():
-                goal = self._encode(td[GOAL_PIXELS], used_up)
-                memory[used_up] = self._plan(
-                    latent[used_up], goal[used_up], memory[used_up], self._seeds(td)[used_up.cpu()]
-                )
-            if remembers:
-                memory[looks] = self._remember(latent[looks], memory[looks])
+        if tensordict.ndim > 1:
+            raise ValueError(f"MPCPolicy takes batches [E] or [], got {list(tensordict.shape)}: reshape the environments to [E].")
+        keys, td = self.tensor_keys, tensordict if tensordict.ndim else tensordict.unsqueeze(0)
+        pixels, memory = td[keys.pixels], self._memory(td)
+        plan_due = memory["cursor"] >= memory["queue"].shape[1]  # [E]
+        has_history = self.planner.context > 1
+        needs_latent = memory["cursor"] % self.planner.world_model.frame_skip == 0 if has_history else plan_due  # [E]
+        if needs_latent.any():
+            latent = self._encode(pixels, needs_latent)  # [E, D], zeros elsewhere
+            if plan_due.any():
+                goal, seeds = self._encode(td[keys.goal_pixels], plan_due), self._seeds(td)[plan_due.cpu()]
+                memory[plan_due] = self._plan(latent[plan_due], goal[plan_due], memory[plan_due], seeds)
+            if has_history:
+                memory[needs_latent] = self._remember(latent[needs_latent], memory[needs_latent])
         step = memory["cursor"]  # [E]
-        action = memory["queue"][torch.arange(len(step), device=step.device), step]  # [E, A]
+        action = memory["queue"][torch.arange(len(step), device=step.device), step].to(pixels.device)  # [E, A]
         memory["cursor"] = step + 1
         if not tensordict.ndim:
             action, memory = action[0], memory[0]
-        return tensordict.set(ACTION, action.to(td[PIXELS].device)).set("mpc", memory)
+        return tensordict.set(keys.action, action).set(keys.memory, memory)
 
     def _memory(self, td: TensorDictBase) -> TensorDict:
-        """A copy of the memory, with fresh environments marked as used up.
+        """A copy of the memory in which the queue of environments at the start of an episode counts as executed.
 
-        Counts lie where the environments are, which ask for them at every step; all else on the model's device.
+        Counts lie on the device of the environments, which read them at every step, all other entries on the model's device.
         """
-        config, model = self.planner.config, self.planner.world_model
+        config, model, keys = self.planner.config, self.planner.world_model, self.tensor_keys
         actions, envs, past = config.receding_horizon * model.frame_skip, len(td), self.planner.context - 1
-        memory = td.get("mpc", None)
+        memory = td.get(keys.memory, None)
         if memory is None:
-            zeros, like = torch.zeros(envs, dtype=torch.long, device=td.device), model.action_mean
+            zeros, like = torch.zeros(envs, dtype=torch.long, device=td.device), model.statistics.mean
             return TensorDict(
                 {
                     "queue": like.new_zeros(envs, actions, len(like)),
@@ -88,81 +127,71 @@ class MPCPolicy(TensorDictModuleBase):
                     "count": zeros,
                     PLAN: like.new_zeros(envs, config.horizon, model.block_dim),
                     PLAN_COST: like.new_zeros(envs, dtype=torch.float32),  # half precision would round it
-                    "past_latent": like.new_zeros(envs, past, model.latent_dim),
+                    PAST_LATENT: like.new_zeros(envs, past, model.latent_dim),
                     PAST_ACTION: like.new_zeros(envs, past, model.block_dim),
                     "past_count": zeros.clone(),
                 },
                 [envs],
             )
         memory = memory.clone()
-        fresh = td.get("is_init", None)
-        if fresh is not None:
-            fresh = fresh.reshape(envs, -1).any(-1)
-            memory["cursor"] = memory["cursor"].masked_fill(fresh, actions)
+        is_init = td.get(keys.is_init, None)
+        if is_init is not None:
+            is_init = is_init.reshape(envs, -1).any(-1)
+            memory["cursor"] = memory["cursor"].masked_fill(is_init, actions)
             for count in ("count", "past_count"):
-                memory[count] = memory[count].masked_fill(fresh, 0)
+                memory[count] = memory[count].masked_fill(is_init, 0)
         return memory
 
-    @staticmethod
-    def _seeds(td: TensorDictBase) -> torch.Tensor:
-        seeds = td.get(PLAN_SEED, None)
+    def _seeds(self, td: TensorDictBase) -> torch.Tensor:
+        """[E] int64, on the CPU."""
+        seeds = td.get(self.tensor_keys.plan_seed, None)
         return torch.arange(len(td), device="cpu") if seeds is None else seeds.reshape(len(td)).cpu()
 
     @torch.no_grad()
-    def _encode(self, pixels: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
-        """Frames [E, 3, H, W] -> latents [E, D] where wanted [E], zeros elsewhere."""
+    def _encode(self, pixels: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
+        """Frames [E, 3, H, W] -> latents [E, D] where a mask [E] is true, zeros elsewhere."""
         model = self.planner.world_model
-        latent = model.action_mean.new_zeros(len(pixels), model.latent_dim)
-        latent[wanted] = model.encode(pixels[wanted].to(latent.device)).to(latent.dtype)
+        latent = model.statistics.mean.new_zeros(len(pixels), model.latent_dim)
+        latent[where] = model.encode(pixels[where].to(latent.device)).to(latent.dtype)
         return latent
 
     def _remember(self, latent: torch.Tensor, memory: TensorDict) -> TensorDict:
-        """Memory of environments that are about to leave the frames of latents [e, D] by their next block."""
-        model, past = self.planner.world_model, memory["past_latent"].shape[1]
+        """Memory of e environments after their present latents [e, D] and next blocks were added to the past."""
+        model, past = self.planner.world_model, memory[PAST_LATENT].shape[1]
         rows = torch.arange(len(latent), device=latent.device).unsqueeze(1)
         steps = memory["cursor"].unsqueeze(1).to(latent.device) + torch.arange(model.frame_skip, device=latent.device)  # [e, F]
         block = model.statistics.normalize(memory["queue"][rows, steps]).flatten(1)  # [e, F * A]
-        memory["past_latent"] = torch.cat([memory["past_latent"], latent.unsqueeze(1)], dim=1)[:, 1:]
+        memory[PAST_LATENT] = torch.cat([memory[PAST_LATENT], latent.unsqueeze(1)], dim=1)[:, 1:]
         memory[PAST_ACTION] = torch.cat([memory[PAST_ACTION], block.unsqueeze(1)], dim=1)[:, 1:]
         memory["past_count"] = (memory["past_count"] + 1).clamp_max(past)
         return memory
 
     def _plan(self, latent: torch.Tensor, goal: torch.Tensor, memory: TensorDict, seeds: torch.Tensor) -> TensorDict:
-        """New memory of e environments whose present and goal are latents [e, D]."""
+        """Memory of e environments after planning from their present latents and goals [e, D]."""
         model, config, device = self.planner.world_model, self.planner.config, latent.device
-        mixed = [_mix(seed, count) for seed, count in zip(seeds.tolist(), memory["count"].tolist())]
+        mixed = [mix_seeds(seed % 2**63, count) for seed, count in zip(seeds.tolist(), memory["count"].tolist())]
         draws = torch.tensor(mixed, device="cpu")
         initial = self._rest_of_last_plan(memory)  # [e, horizon, F * A]
-        result = TensorDict({PLAN: torch.zeros_like(initial), PLAN_COST: torch.zeros_like(memory[PLAN_COST])}, [len(latent)])
-        for past in memory["past_count"].unique().tolist():  # a context of one frame has no past, and no padding either
+        plan, cost = torch.zeros_like(initial), torch.zeros_like(memory[PLAN_COST])
+        for past in memory["past_count"].unique().tolist():  # contexts of one length can be planned from together
             rows = memory["past_count"] == past
-            first = memory["past_latent"].shape[1] - past
-            context = torch.cat([memory["past_latent"][rows, first:], latent[rows].unsqueeze(1)], dim=1)  # [., C, D]
-            found = self.planner.plan(
-                context,
-                goal[rows],
-                draws[rows.cpu()],
-                past_action=memory[PAST_ACTION][rows, first:],
-                initial=initial[rows],
+            first = memory[PAST_LATENT].shape[1] - past
+            context = torch.cat([memory[PAST_LATENT][rows, first:], latent[rows].unsqueeze(1)], dim=1)  # [., C, D]
+            past_action = memory[PAST_ACTION][rows, first:]
+            result = self.planner.plan(
+                context, goal[rows], draws[rows.cpu()], past_action=past_action, initial=initial[rows]
             )
-            result[PLAN][rows] = found[PLAN].to(initial.dtype)
-            result[PLAN_COST][rows] = found[PLAN_COST].to(result[PLAN_COST].dtype)
-        blocks = result[PLAN][:, : config.receding_horizon]  # [e, R, F * A]
-        queue = blocks.unflatten(-1, (model.frame_skip, -1)).flatten(1, 2)  # [e, R * F, A]
-        queue = model.statistics.denormalize(queue)
-        if self.planner.action_bounds is not None:  # undo the rounding of z-scoring forth and back
+            plan[rows], cost[rows] = result[PLAN].to(plan.dtype), result[PLAN_COST].to(cost.dtype)
+        blocks = plan[:, : config.receding_horizon]  # [e, R, F * A]
+        queue = model.statistics.denormalize(blocks.unflatten(-1, (model.frame_skip, -1)).flatten(1, 2))  # [e, R * F, A]
+        if self.planner.action_bounds is not None:  # z-scoring and back may round an action out of the bounds
             queue = queue.clamp(*(bound.to(device) for bound in self.planner.action_bounds))
         count, queue = memory["count"] + 1, queue.to(memory["queue"].dtype)
-        return memory.update({**result, "queue": queue, "cursor": torch.zeros_like(count), "count": count})
+        return memory.update({PLAN: plan, PLAN_COST: cost, "queue": queue, "cursor": torch.zeros_like(count), "count": count})
 
     def _rest_of_last_plan(self, memory: TensorDict) -> torch.Tensor:
         """The blocks of the last plan that were not executed, then mean actions: [e, horizon, F * A]."""
         last, executed = memory[PLAN], self.planner.config.receding_horizon
         rest = torch.cat([last[:, executed:], torch.zeros_like(last[:, :executed])], dim=1)
-        begun = (memory["count"] > 0)[:, None, None].to(rest.device)
-        return torch.where(begun, rest, 0.0) if self.planner.config.warm_start else torch.zeros_like(rest)
-
-
-def _mix(seed: int, count: int) -> int:
-    """One seed for the count-th plan of an environment."""
-    return int(np.random.SeedSequence([seed % 2**63, count]).generate_state(1, np.uint64)[0] >> np.uint64(1))
+        has_plan = (memory["count"] > 0)[:, None, None].to(rest.device)
+        return torch.where(has_plan, rest, 0.0) if self.planner.config.warm_start else torch.zeros_like(rest)

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import pytest
 import torch
+from making import make_planner, SEARCHING, UNIT
 from tensordict import TensorDict
 
 from torchrl_ficreg import LatentPlanner, MPCPolicy, PlanConfig
 from torchrl_ficreg.data import ActionStatistics
-from torchrl_ficreg.planners import SEARCHES
 
-pytestmark = pytest.mark.usefixtures("fast_bf16")
-
-UNIT = ([-1.0, -1.0], [1.0, 1.0])
-SIZES = {"num_candidates": 16, "num_elites": 4, "iterations": 2, "horizon": 3, "precision": "fp32"}
 STEPS = 2  # raw actions in a block of the tiny world
 
 
 class Recorded(LatentPlanner):
-    """Plans one random block after another and keeps every problem it was given, with its answer."""
+    """Plans random blocks and keeps every problem that it got, with its plan."""
 
     def _search(self, problem):
         plan = problem.clamp(0.5 * problem.noise(1)[:, 0])
@@ -32,7 +28,7 @@ class Recorded(LatentPlanner):
 
 
 def recorded(world, bounds=UNIT, **settings):
-    settings = {**SIZES, "receding_horizon": 1, **settings}
+    settings = {"horizon": 3, "receding_horizon": 1, "precision": "fp32", **settings}
     return Recorded(world, PlanConfig(**settings), action_bounds=bounds)
 
 
@@ -41,9 +37,11 @@ def frames(count, seed=0):
     return torch.randint(0, 256, (count, 3, 16, 16), generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
 
 
-def serve(policy, steps, envs=1, resets=None):
+def serve(policy, steps, envs=1, resets=None, seeds=None):
     """New frames at every step; ``resets`` names environments by step. Frames and actions, [steps, E, ...] each."""
     td = TensorDict({"goal_pixels": frames(envs, 999)}, [envs])
+    if seeds is not None:
+        td["plan_seed"] = torch.tensor(seeds)
     seen, actions = [], []
     for step in range(steps):
         td["pixels"] = frames(envs, step)
@@ -57,17 +55,16 @@ def serve(policy, steps, envs=1, resets=None):
 # A context that is given
 
 
-@pytest.mark.parametrize("search", [name for name in SEARCHES if name != "policy"])
+@pytest.mark.parametrize("search", SEARCHING)
 def test_the_cost_of_a_plan_is_that_of_its_rollout_from_the_context(tiny_world, search):
-    """Three real frames and the two blocks between them; without them the same search finds something else."""
-    world, kind = tiny_world(), SEARCHES[search]
+    """Three real frames and the two blocks between them; without them the same search finds another plan."""
+    world = tiny_world()
     context, past, goal = torch.randn(2, 3, 6), torch.randn(2, 2, 4), torch.randn(2, 6)
-    settings = {**SIZES, "receding_horizon": 1}
-    result = kind(world, kind.config_class(**settings), action_bounds=UNIT).plan(context, goal, past_action=past)
+    result = make_planner(search, world).plan(context, goal, past_action=past)
     with torch.no_grad():
         end = world.rollout(context, torch.cat([past, result["plan"]], dim=1))[:, -1]
     torch.testing.assert_close(result["plan_cost"], (end - goal).square().sum(-1))
-    one_frame = kind(world, kind.config_class(**settings, history="one_frame"), action_bounds=UNIT)
+    one_frame = make_planner(search, world, history="one_frame")
     other = one_frame.plan(context, goal, past_action=past)
     assert not torch.allclose(other["plan_cost"], result["plan_cost"], rtol=1e-3)
     assert other["plan"].equal(one_frame.plan(context[:, -1], goal)["plan"])
@@ -82,15 +79,6 @@ def test_of_a_longer_context_the_newest_frames_are_taken(tiny_world, history):
     for env, (problem, _) in enumerate(planner.problems):
         assert problem.latent.equal(context[env : env + 1, 5 - history :])
         assert problem.past_action.equal(past[env : env + 1, 5 - history :])
-
-
-def test_a_tensordict_may_hold_the_context(tiny_world):
-    planner = recorded(tiny_world())
-    td = TensorDict({"latent": torch.randn(2, 3, 6), "goal_latent": torch.randn(2, 6)}, [2])
-    td["past_action"] = torch.randn(2, 2, 4)
-    planner(td)
-    assert planner.contexts == [3, 3]
-    assert planner.problems[1][0].past_action.equal(td["past_action"][1:])
 
 
 # A context that is collected
@@ -123,15 +111,15 @@ def test_the_context_grows_frame_by_frame_and_then_slides(tiny_world, receding_h
 @pytest.mark.parametrize(
     ("sizes", "settings"), [({}, {"history": "one_frame"}), ({"history": 1}, {"history": "context"})]
 )
-def test_where_one_frame_is_looked_at_none_is_collected(tiny_world, sizes, settings):
+def test_where_one_frame_is_used_none_is_collected(tiny_world, sizes, settings):
     planner = recorded(tiny_world(**sizes), **settings)
     serve(MPCPolicy(planner), 5 * STEPS)
     assert planner.contexts == [1] * 5
     assert all(problem.past_action.shape == (1, 0, 4) for problem, _ in planner.problems)
 
 
-def test_a_reset_forgets(tiny_world):
-    """The environment that starts anew does so from one frame; its neighbour remembers on."""
+def test_a_reset_clears_the_context_of_one_environment(tiny_world):
+    """The environment that was reset starts from one frame; the other keeps its context."""
     world = tiny_world()
     planner = recorded(world)
     seen, _ = serve(MPCPolicy(planner), 4 * STEPS, envs=2, resets={2 * STEPS: [1]})
@@ -143,8 +131,8 @@ def test_a_reset_forgets(tiny_world):
     torch.testing.assert_close(after[0][:, 0], fresh)
 
 
-def test_a_reset_in_the_middle_of_a_block_forgets_that_block(tiny_world):
-    """The half-executed block leads to no frame of the new episode."""
+def test_a_reset_in_the_middle_of_a_block_drops_that_block(tiny_world):
+    """No frame of the new episode follows it."""
     planner = recorded(tiny_world(), receding_horizon=2)
     _, actions = serve(MPCPolicy(planner), 1 + 4 * STEPS, resets={1: [0]})
     assert planner.contexts == [1, 1, 3]
@@ -155,19 +143,18 @@ def test_a_reset_in_the_middle_of_a_block_forgets_that_block(tiny_world):
 @pytest.mark.parametrize("receding_horizon", [1, 2])
 def test_environments_of_different_ages_act_as_they_do_alone(tiny_world, monkeypatch, receding_horizon):
     """Planned for in groups of one age, each with its own context, whether one by one or side by side."""
-    kind, envs, steps = SEARCHES["cem"], 4, 6 * STEPS
+    envs, steps, seeds = 4, 6 * STEPS, [8, 3, 5, 1]
     resets = {STEPS: [1], 3 * STEPS: [1, 2], 3 * STEPS + 1: [3]}
-    config = kind.config_class(**SIZES, receding_horizon=receding_horizon)
-    policy = MPCPolicy(kind(tiny_world(), config, action_bounds=UNIT))
-    _, together = serve(policy, steps, envs, resets)
+    policy = MPCPolicy(make_planner("cem", tiny_world(), receding_horizon=receding_horizon, iterations=1))
+    _, together = serve(policy, steps, envs, resets, seeds)
     for env in range(envs):
-        td = TensorDict({"goal_pixels": frames(envs, 999)[env : env + 1], "plan_seed": torch.tensor([env])}, [1])
+        td = TensorDict({"goal_pixels": frames(envs, 999)[env : env + 1], "plan_seed": torch.tensor([seeds[env]])}, [1])
         for step in range(steps):
             td["pixels"] = frames(envs, step)[env : env + 1]
             td["is_init"] = torch.tensor([[env in resets.get(step, ())]])
             assert policy(td)["action"].equal(together[step, env : env + 1])
     monkeypatch.setattr(LatentPlanner, "_group_size", lambda self, latent: len(latent))
-    torch.testing.assert_close(serve(policy, steps, envs, resets)[1], together, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(serve(policy, steps, envs, resets, seeds)[1], together, rtol=1e-3, atol=1e-3)
 
 
 def test_those_of_one_age_are_planned_for_together(tiny_world, monkeypatch):
@@ -203,7 +190,7 @@ def test_without_a_warm_start_it_starts_from_mean_actions(tiny_world):
 
 
 def test_a_fresh_environment_starts_from_mean_actions(tiny_world):
-    """Nothing of the old episode's plan is left, while the neighbour goes on with its own."""
+    """Nothing of the old episode's plan is left, while the other environment continues its own."""
     planner = recorded(tiny_world())
     serve(MPCPolicy(planner), 3 * STEPS, envs=2, resets={2 * STEPS: [0]})
     starts = {problem.latent.shape[1]: problem.initial for problem, _ in planner.problems[-2:]}
@@ -212,8 +199,6 @@ def test_a_fresh_environment_starts_from_mean_actions(tiny_world):
 
 def test_a_search_searches_around_its_initial_plan(linear_world):
     """Candidate 0 of the first iteration is the initial plan: with the optimum given, nothing better is found."""
-    kind = SEARCHES["shooting"]
-    planner = kind(linear_world(), PlanConfig(**SIZES, receding_horizon=1), action_bounds=UNIT)
     initial = torch.full((1, 3, 4), 0.5)
-    result = planner.plan(torch.zeros(1, 2), torch.tensor([[3.0, 3.0]]), initial=initial)
+    result = make_planner("shooting", linear_world()).plan(torch.zeros(1, 2), torch.tensor([[3.0, 3.0]]), initial=initial)
     assert result["plan"].equal(initial) and result["plan_cost"].item() == 0

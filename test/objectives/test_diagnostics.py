@@ -1,4 +1,4 @@
-"""Claims about the alarm: silent on a Gaussian of any shape, loud at collapse, at low rank and at NaN."""
+"""Claims about LatentHealth: no alarm on a Gaussian of any shape, one at collapse, at low rank and at NaN."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def noise(*shape: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("shape", [(4, 512, 64), (128, 192), (32, 2), (256, 1), (8, 192), (4, 8)])
-def test_a_gaussian_is_at_the_floor_and_raises_no_alarm(shape):
+def test_a_gaussian_has_a_ratio_of_1_and_raises_no_alarm(shape):
     health = latent_health(noise(*shape))
     if math.prod(shape[:-1]) >= 128 and shape[-1] > 1:
         assert health.floor_ratio == pytest.approx(1, abs=0.2)
@@ -43,7 +43,7 @@ def test_collapse_to_a_point_raises_the_alarm(samples, place):
 
 
 def test_low_rank_raises_the_alarm():
-    """All dimensions are one and the same: some directions look healthy, the rank does not."""
+    """All dimensions are equal: along some directions the latents are Gaussian, and their rank is 1."""
     latent = noise(256, 1).expand(256, 32) / 32**0.5
     health = latent_health(latent)
     assert health.effective_rank == pytest.approx(1, abs=0.01)
@@ -57,7 +57,7 @@ def test_latents_that_are_not_finite_raise_the_alarm(value):
     assert "not finite" in latent_health(latent).alarm
 
 
-def test_the_regulariser_is_left_as_it_was():
+def test_the_regularizer_is_not_modified():
     for training in (True, False):
         sigreg = SIGReg(16, unit="batch_time").train(training)
         health = latent_health(noise(4, 32, 8).requires_grad_(), sigreg)

@@ -1,4 +1,4 @@
-"""Claims about SIGReg: it is the Epps-Pulley statistic, cheaper; golden values at N(0, I) and at collapse."""
+"""Claims about SIGReg: the Epps-Pulley statistic, golden values at N(0, I) and at collapse, masks, random directions."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def textbook(latent: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
 
 
 def directions_of(sigreg: SIGReg, dim: int) -> torch.Tensor:
-    """Those of the next call, [D, M]; none is used up."""
+    """Those of the next call, [D, M]; the state does not advance."""
     training = sigreg.training
     directions = sigreg.eval()._draw(dim)
     sigreg.train(training)
@@ -50,11 +50,11 @@ def with_gradient(function, latent, *args):
 # The numbers
 
 
-@pytest.mark.parametrize("batch", [32, 128, 1024, 4096])
+@pytest.mark.parametrize("batch", [32, 128, 1024])
 def test_it_is_1_05_on_a_gaussian_at_any_batch_size(batch):
     """1.05 ± 0.1, with enough dimensions for the directions to be nearly independent."""
     assert ON_GAUSSIAN == pytest.approx(1.05, abs=0.005)
-    value = SIGReg(1024 if batch < 1024 else 256)(noise(4, batch, 192))
+    value = SIGReg(512)(noise(4, batch, 192))
     assert value.item() == pytest.approx(ON_GAUSSIAN, abs=0.1)
 
 
@@ -116,7 +116,7 @@ def test_it_pulls_a_collapsed_batch_apart():
     torch.testing.assert_close(latent.T.cov().detach(), torch.eye(2), rtol=0, atol=0.25)
 
 
-def test_it_offers_no_second_derivative_rather_than_a_wrong_one():
+def test_it_has_no_second_derivative():
     latent = noise(8, 3).requires_grad_()
     (gradient,) = torch.autograd.grad(SIGReg(4)(latent), latent, create_graph=True)
     assert not gradient.requires_grad
@@ -135,27 +135,22 @@ def test_the_order_of_the_batch_does_not_matter():
 
 
 def test_a_rotation_does_not_matter_in_distribution():
-    """Far from Gaussian, one dimension wide and three narrow: mean and spread over 400 draws stay the same."""
+    """Far from Gaussian, one dimension wide and three narrow: mean and std over 200 draws stay the same."""
     latent = noise(64, 4) * torch.tensor([3.0, 0.3, 0.3, 0.3])
     rotation = torch.linalg.qr(noise(4, 4, seed=1))[0]
     straight, rotated = SIGReg(16), SIGReg(16, seed=1)
-    values = torch.tensor([[straight(latent), rotated(latent @ rotation)] for _ in range(400)])  # [400, 2]
+    values = torch.tensor([[straight(latent), rotated(latent @ rotation)] for _ in range(200)])  # [400, 2]
     error = (values.var(0).sum() / len(values)).sqrt()
     assert (values[:, 0].mean() - values[:, 1].mean()).abs() < 4 * error
     assert values[:, 0].std().item() == pytest.approx(values[:, 1].std().item(), rel=0.2)
 
 
-def test_time_steps_are_judged_apart_and_averaged():
+def test_time_steps_are_averaged_and_batch_time_takes_all_latents_together():
     latent = noise(3, 16, 4)
-    single = [SIGReg(16)(row) for row in latent]
-    torch.testing.assert_close(SIGReg(16)(latent), torch.stack(single).mean())
-
-
-def test_batch_time_judges_all_latents_together():
-    latent = noise(3, 16, 4)
-    together = SIGReg(16, unit="batch_time")(latent)
+    by_time, together = SIGReg(16)(latent), SIGReg(16, unit="batch_time")(latent)
+    torch.testing.assert_close(by_time, torch.stack([SIGReg(16)(row) for row in latent]).mean())
     torch.testing.assert_close(together, SIGReg(16)(latent.flatten(0, 1)))
-    assert not together.isclose(SIGReg(16)(latent))
+    assert not together.isclose(by_time)
 
 
 # Masks
@@ -195,11 +190,11 @@ def test_directions_are_drawn_anew_at_every_call_in_train_mode_only():
     third = sigreg(latent)
     assert third.equal(sigreg(latent))
     assert sigreg.generator_state.equal(state)
-    assert sigreg.train()(latent).equal(third)  # looked at before, used now
+    assert sigreg.train()(latent).equal(third)  # used in eval mode, drawn now
     assert sigreg.generator_state.tolist() == [0, 3]
 
 
-def test_the_state_travels_with_checkpoints():
+def test_the_state_is_saved():
     one, other, latent = SIGReg(4, seed=7), SIGReg(4), noise(8, 4)
     one(latent)
     assert list(one.state_dict()) == ["generator_state"]
@@ -208,7 +203,7 @@ def test_the_state_travels_with_checkpoints():
     assert [one(latent).item() for _ in range(3)] == [other(latent).item() for _ in range(3)]
 
 
-def test_seeds_differ_and_the_global_random_state_takes_no_part():
+def test_seeds_differ_and_the_global_random_state_is_neither_read_nor_changed():
     latent = noise(8, 4)
     torch.manual_seed(0)
     before = torch.get_rng_state()
@@ -231,8 +226,8 @@ def test_no_radius_is_zero_or_infinite():
     radius = (-2 * uniform.log()).sqrt()
     assert (radius > 0).all()
     assert radius.isfinite().all()
-    draws = torch.cat([standard_normal(torch.tensor([0, draw]), 2**20) for draw in range(8)])
-    pairs = draws.view(8, 2, -1)  # the two halves of a draw share radii
+    draws = torch.cat([standard_normal(torch.tensor([0, draw]), 2**20) for draw in range(4)])
+    pairs = draws.view(4, 2, -1)  # the two halves of a draw share radii
     assert pairs.square().sum(1).min() > 0
     assert draws.abs().max() < math.sqrt(2 * 24 * math.log(2))
 
@@ -261,7 +256,7 @@ def test_neighbouring_positions_draws_and_seeds_are_uncorrelated():
     assert not draw(1, 0).equal(draw(0, 1))
 
 
-def test_one_state_gives_one_sequence_of_any_length_of_state_only():
+def test_numbers_depend_on_the_state_only_which_is_not_modified():
     state = torch.tensor([3, 5])
     assert standard_normal(state, 10).equal(standard_normal(state, 10))
     assert len(standard_normal(state, 7)) == 7
@@ -313,22 +308,17 @@ def test_latents_of_another_shape_are_refused(shape):
         SIGReg(4)(torch.zeros(shape))
 
 
-@pytest.mark.parametrize(
-    "mask", [torch.ones(2, 8), torch.ones(8, dtype=torch.bool), torch.ones(2, 8, 1, dtype=torch.bool)]
-)
-def test_masks_of_another_shape_or_kind_are_refused(mask):
+@pytest.mark.parametrize("mask", [torch.ones(2, 8), torch.ones(8) > 0, torch.ones(2, 8, 1) > 0])
+def test_masks_of_another_shape_or_dtype_are_refused(mask):
     with pytest.raises(ValueError, match=r"the mask must be \[2, 8\] bool, got"):
         SIGReg(4)(torch.zeros(2, 8, 3), mask)
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"num_directions": 0}, {"num_knots": 1}, *({"max_knot": value} for value in (0.0, math.nan, math.inf))]
+    "wrong",
+    [{"num_directions": 0}, {"num_knots": 1}, *({"max_knot": x} for x in (0.0, math.nan, math.inf)), {"unit": "step"}],
 )
-def test_impossible_settings_are_refused(wrong):
-    with pytest.raises(ValueError, match="num_directions >= 1, num_knots >= 2 and max_knot > 0"):
+def test_wrong_settings_are_refused(wrong):
+    message = "unknown unit 'step'" if "unit" in wrong else "num_directions >= 1, num_knots >= 2 and max_knot > 0"
+    with pytest.raises(ValueError, match=message):
         SIGReg(**wrong)
-
-
-def test_an_unknown_unit_is_refused():
-    with pytest.raises(ValueError, match="unknown unit 'step': choose 'time' or 'batch_time'"):
-        SIGReg(unit="step")

@@ -1,4 +1,4 @@
-"""Losses: who receives gradient, and from what."""
+"""Losses of world models, their terms, and diagnostics of gradients and latents."""
 
 from torchrl_ficreg.objectives.diagnostics import gradient_flow, latent_health, LatentHealth
 from torchrl_ficreg.objectives.ficreg import FICRegLoss

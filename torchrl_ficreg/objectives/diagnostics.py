@@ -1,4 +1,4 @@
-"""Diagnostics of a loss: gradient norms per network and term, and collapse of the latents."""
+"""Diagnostics of a loss: gradient norms for each term and network, and collapse of the latents."""
 
 from __future__ import annotations
 
@@ -9,22 +9,21 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.objectives.common import LossModule
 
-from torchrl_ficreg.distributed import gather_clips
+from torchrl_ficreg.distributed import all_gather
 from torchrl_ficreg.objectives.sigreg import SIGReg
 
 
 def gradient_flow(loss: LossModule, clip: TensorDictBase) -> dict[str, dict[str, float]]:
-    """Gradient norm of every loss term at every network.
+    """Norm of the gradient of each loss term with respect to the parameters of each network.
 
-    Nothing is accumulated into ``.grad``. Random layers and BatchNorm statistics are used and moved as by one call of
-    the loss.
+    Nothing is accumulated into ``.grad``. BatchNorm statistics and random state change as by one call of the loss.
 
     Args:
-        loss: a loss whose networks were registered with ``convert_to_functional``.
-        clip: what the loss reads.
+        loss (LossModule): one whose networks were registered with ``convert_to_functional``.
+        clip (TensorDictBase): input of the loss.
 
     Returns:
-        ``{term: {network: norm}}``; exactly 0.0 where no gradient arrives.
+        dict[str, dict[str, float]]: ``{term: {network: norm}}``; exactly 0.0 where a network receives no gradient.
 
     Examples:
         >>> import torch
@@ -54,16 +53,16 @@ def gradient_flow(loss: LossModule, clip: TensorDictBase) -> dict[str, dict[str,
     return table
 
 
-GAUSSIAN_FLOOR = 1.0527  # value of SIGReg on N(0, I): the integral of (1 - exp(-t^2)) exp(-t^2 / 2) over [-3, 3]
-COLLAPSE = 0.40205  # value per sample when all latents are zero
+_SIGREG_OF_GAUSSIAN = 1.0527  # on N(0, I): the integral of (1 - exp(-t^2)) exp(-t^2 / 2) over [-3, 3]
+_SIGREG_OF_COLLAPSE = 0.40205  # for each sample, where all latents are zero
 
 
 @dataclass(frozen=True)
 class LatentHealth:
-    """Two numbers about a batch of latents.
+    """Measures of collapse of a batch of latents.
 
     Attributes:
-        floor_ratio: SIGReg over its value on a Gaussian: 1 is as good as it gets, 0.38 B is collapse.
+        floor_ratio: SIGReg over its value on a Gaussian: 1 for a Gaussian, 0.38 B for collapse to a point.
         effective_rank: exponential of the entropy of the covariance spectrum (Roy and Vetterli, 2007), from 1 to D.
         dims: D.
         samples: B, of one time step.
@@ -76,15 +75,15 @@ class LatentHealth:
 
     @property
     def alarm(self) -> str | None:
-        """One line that says what is wrong, or None."""
+        """A warning of one line, or None for healthy latents."""
         if not math.isfinite(self.floor_ratio):
             return "the latents are not finite: lower the learning rate, and look for NaN in the clips."
-        collapsed = self.samples * COLLAPSE / GAUSSIAN_FLOOR
-        # Among a handful of samples collapse cannot be told from chance.
+        collapsed = self.samples * _SIGREG_OF_COLLAPSE / _SIGREG_OF_GAUSSIAN
+        # With fewer samples, collapse is within the variance of the statistic.
         if self.samples >= 8 and self.floor_ratio > max(2.0, 0.5 * collapsed):
             return (
-                f"the latents are close to collapse: SIGReg is {self.floor_ratio:.0f} times its floor, {collapsed:.0f} "
-                "is a single point. Raise sigreg_coeff or lower the learning rate."
+                f"the latents are close to collapse: SIGReg is {self.floor_ratio:.0f} times its value on a "
+                f"Gaussian, a single point gives {collapsed:.0f}. Raise sigreg_coeff or lower the learning rate."
             )
         if self.effective_rank < max(1.5, 0.1 * min(self.dims, self.samples)) and self.dims > 1:
             return (
@@ -96,11 +95,14 @@ class LatentHealth:
 
 @torch.no_grad()
 def latent_health(latent: torch.Tensor, sigreg: SIGReg | None = None) -> LatentHealth:
-    """Measures a batch of latents; on several processes, which must all ask, the global batch of their equal shares.
+    """Measures a batch of latents; on several ranks the global batch, of equal local batches. All ranks must call it.
 
     Args:
-        latent: [T, B, D], or [B, D].
-        sigreg: the regulariser to measure with; a default one when None. It is used in eval mode and left as it was.
+        latent (torch.Tensor): [T, B, D], or [B, D].
+        sigreg (SIGReg, optional): used in eval mode and not modified. Default: ``None``, a new :class:`SIGReg`.
+
+    Returns:
+        LatentHealth: its :attr:`~LatentHealth.alarm` is None for healthy latents.
 
     Examples:
         >>> _ = torch.manual_seed(0)
@@ -116,12 +118,12 @@ def latent_health(latent: torch.Tensor, sigreg: SIGReg | None = None) -> LatentH
         value = sigreg.eval()(latent).item()
     finally:
         sigreg.train(training)
-    latent = gather_clips(latent.float(), dim=-2)  # SIGReg above has seen all processes' latents on its own
+    latent = all_gather(latent.float(), dim=-2)  # after SIGReg, which is global itself
     flat = latent.flatten(0, -2)  # [N, D]
     samples = latent.shape[-2] if sigreg.unit == "time" else len(flat)
     if not flat.isfinite().all():
         return LatentHealth(math.nan, math.nan, flat.shape[1], samples)
     spectrum = torch.linalg.svdvals(flat - flat.mean(0)).square()
-    share = spectrum / spectrum.sum().clamp_min(1e-12)
-    entropy = -(share * share.clamp_min(1e-12).log()).sum()
-    return LatentHealth(value / GAUSSIAN_FLOOR, entropy.exp().item(), flat.shape[1], samples)
+    fraction = spectrum / spectrum.sum().clamp_min(1e-12)
+    entropy = -(fraction * fraction.clamp_min(1e-12).log()).sum()
+    return LatentHealth(value / _SIGREG_OF_GAUSSIAN, entropy.exp().item(), flat.shape[1], samples)

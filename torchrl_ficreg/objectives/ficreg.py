@@ -1,4 +1,4 @@
-"""The FICReg objective: a frozen inverse dynamics model judges imagined transitions."""
+"""The FICReg loss: consistency of imagined transitions with a frozen inverse dynamics model."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
-from torchrl_ficreg.distributed import gather_clips
-from torchrl_ficreg.modules.inverse import LOG_VAR
+from torchrl_ficreg.distributed import all_gather
 from torchrl_ficreg.objectives.base import Clip, Reduction, takes_clip, with_own_buffers
-from torchrl_ficreg.objectives.inverse_terms import inverse_error, judge_report, mean_where, Recovered, trust
+from torchrl_ficreg.objectives.inverse_terms import (
+    inverse_error,
+    inverse_model_r2,
+    masked_mean,
+    Recovered,
+    reliability_weight,
+)
 from torchrl_ficreg.objectives.lewm import LeWMLoss
 from torchrl_ficreg.objectives.sigreg import SIGReg
 from torchrl_ficreg.objectives.terms import gaussian_nll, squared_error
@@ -23,10 +28,10 @@ class FICRegLoss(LeWMLoss):
     .. math:: L_{LeWM} + \mu \|h_\psi(\bar z_t, \bar z_{t+1}) - a_t\|^2
               + \gamma \|h_{\bar\psi}(\bar z_t, \hat z_{t+1}) - a_t\|^2
 
-    A bar stands for a detached tensor or frozen weights. The inverse dynamics model h learns on real transitions
-    which action was taken; frozen, it then asks of every imagined transition that the same action be recoverable.
+    A bar stands for a detached tensor or frozen weights. The inverse dynamics model h learns to recover the action from real
+    transitions. The consistency term asks that the frozen inverse model recover the same action from imagined transitions.
 
-    Who receives gradient:
+    Which network receives gradient:
 
     ====================  =======  =========  =============
     term                  encoder  predictor  inverse model
@@ -37,38 +42,44 @@ class FICRegLoss(LeWMLoss):
     ``loss_consistency``  no       yes        no
     ====================  =======  =========  =============
 
-    Algorithm 1 of the paper, taken literally, breaks the last row: its one prediction is made from live latents, so the
-    consistency term reaches the encoder through the predictor's input. ``context="detached"`` keeps the table exactly,
-    by a second prediction from detached latents; ``context="live"`` is Algorithm 1 to the letter, and what the authors' code
-    does.
+    Algorithm 1 of the paper, taken literally, does not keep the last row: its one prediction is made from live latents, so that
+    the consistency term reaches the encoder through the input of the predictor. ``context="detached"`` keeps the table
+    exactly, by a second prediction from detached latents; ``context="live"`` is Algorithm 1 and the authors' code.
 
-    The clip is that of :class:`LeWMLoss`. All random draws of the baseline terms come first, so that under one seed
-    the encoder's gradient equals that of :class:`LeWMLoss` to the last bit.
+    Reads the clip of :class:`LeWMLoss`. Writes ``loss_pred``, ``loss_sigreg``, ``loss_idm`` and ``loss_consistency``, already
+    weighted. All random draws of the baseline terms come first, so that under one seed the gradient of the encoder is
+    bit-identical to that of :class:`LeWMLoss`.
 
     The arguments from ``consistency`` on go beyond the paper; their defaults are the paper.
 
     Args:
-        encoder, predictor: see :class:`LeWMLoss`.
-        inverse_model: reads two latents [..., D], writes the action block between them [..., F * A] and, where it
-            knows, how sure it is; see :class:`~torchrl_ficreg.InverseDynamicsModel`.
-        sigreg, sigreg_coeff, reduction, num_frames: see :class:`LeWMLoss`.
-        idm_coeff: mu, weight of the inverse model's own loss.
-        consistency_coeff: gamma, weight of the judgement on imagined transitions.
-        context: ``"detached"`` or ``"live"``, see above.
-        consistency: ``"mse"``; ``"nll"``, the likelihood under a Gaussian judge; or ``"trusted"``, the squared error
-            weighted, for every sample and action dimension, by how well the judge does on the real transition of the
-            same clip (:func:`~torchrl_ficreg.objectives.inverse_terms.trust`): where it cannot tell, it does not push.
-        consistency_target: ``"action"``, the one taken, or ``"judge"``, what the judge recovers from the *real*
-            transition: predictions are then not rewarded for carrying more of the action than reality does, as at
-            walls and contacts.
-        consistency_steps: k; also judges imagined transitions 2 to k steps deep, each fed by predictions.
-        diagnostics: also write, detached and no part of the objective, ``judge_r2_real``, ``judge_r2_imagined`` and
-            ``judge_r2_shuffled`` [F * A] (:func:`~torchrl_ficreg.objectives.inverse_terms.judge_report`) and ``judge_trust``
-            [F * A], the mean weight.
+        encoder (TensorDictModule): see :class:`LeWMLoss`.
+        predictor (TensorDictModule): see :class:`LeWMLoss`.
+        inverse_model (TensorDictModule): reads two latents [..., D], writes the action block between them [..., F * A] and,
+            optionally, its log-variance or the variance of an ensemble; see :class:`~torchrl_ficreg.InverseDynamicsModel`.
+        sigreg (SIGReg, optional): see :class:`LeWMLoss`. Default: ``None``.
+        sigreg_coeff (float, optional): lambda, see :class:`LeWMLoss`. Default: ``0.09``.
+        idm_coeff (float, optional): mu, weight of the training error of the inverse model. Default: ``0.1``.
+        consistency_coeff (float, optional): gamma, weight of the consistency term. Default: ``0.1``.
+        context ("detached" or "live", optional): input latents of the prediction, see above. Default: ``"detached"``.
+        reduction ("mean", "sum" or "none", optional): see :class:`LeWMLoss`. Default: ``"mean"``.
+        num_frames (int, optional): see :class:`LeWMLoss`. Default: ``None``.
+        consistency ("mse", "nll" or "trusted", optional): ``"mse"``, the squared error; ``"nll"``, the negative
+            log-likelihood under a Gaussian inverse model; ``"trusted"``, the squared error weighted, for each sample and
+            action dimension, by :func:`~torchrl_ficreg.objectives.inverse_terms.reliability_weight` of the real transition of
+            the same clip. Default: ``"mse"``.
+        consistency_target ("action" or "judge", optional): ``"action"``, the one taken; ``"judge"``, the one that the
+            inverse model recovers from the *real* transition, so that predictions are not rewarded for holding more of the
+            action than real latents do, as at walls and contacts. Default: ``"action"``.
+        consistency_steps (int, optional): k; the term also covers imagined transitions of rollouts 2 to k steps deep, which
+            are fed with predictions. Default: ``1``.
+        diagnostics (bool, optional): also write, detached, the results of
+            :func:`~torchrl_ficreg.objectives.inverse_terms.inverse_model_r2` and ``judge_trust``, the mean reliability
+            weight, each [F * A]. Default: ``False``.
 
     Raises:
-        KeyError, ValueError, TypeError: see :class:`LeWMLoss`; ValueError for an unknown choice, for ``"nll"`` without
-            a Gaussian judge, and for clips of fewer than ``consistency_steps`` + 1 frames.
+        KeyError, ValueError, TypeError: see :class:`LeWMLoss`; ValueError also for an unknown choice, for ``"nll"`` without a
+            Gaussian inverse model, and for clips of fewer than ``consistency_steps`` + 1 frames.
 
     Examples:
         >>> import torch
@@ -115,15 +126,13 @@ class FICRegLoss(LeWMLoss):
             inverse_model=inverse_model,
         )
         self._register_coefficients(idm_coeff=idm_coeff, consistency_coeff=consistency_coeff)
-        _check("context", context, ("detached", "live"))
-        _check("consistency", consistency, ("mse", "nll", "trusted"))
-        _check("consistency_target", consistency_target, ("action", "judge"))
+        _check_choice("context", context, ("detached", "live"))
+        _check_choice("consistency", consistency, ("mse", "nll", "trusted"))
+        _check_choice("consistency_target", consistency_target, ("action", "judge"))
         if not (isinstance(consistency_steps, int) and consistency_steps >= 1):
             raise ValueError(f"consistency_steps must be a positive whole number, got {consistency_steps}.")
-        if consistency == "nll" and LOG_VAR not in inverse_model.out_keys:
-            raise ValueError(
-                f"consistency='nll' needs a judge that writes {LOG_VAR!r}: InverseDynamicsModel(kind='gaussian')."
-            )
+        if consistency == "nll" and len(inverse_model.out_keys) < 2:
+            raise self._no_likelihood()
         self.context, self.consistency, self.consistency_target = context, consistency, consistency_target
         self.consistency_steps, self.diagnostics = consistency_steps, diagnostics
         if diagnostics:
@@ -133,28 +142,33 @@ class FICRegLoss(LeWMLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
         clip = self._read(tensordict)
-        latent = self._encode(clip.pixels)  # [B, T, D]
-        predicted = self._predict(latent[..., :-1, :], clip.action, self.predictor_params)  # [B, T - 1, D]
+        latent = self._encode(clip)  # [B, T, D]; gradient for the encoder
+        predicted = self._predict(latent[..., :-1, :], clip.action, self.predictor_params)  # [B, T - 1, D]; for both
         terms = self._baseline_terms(clip, latent, predicted)
-        real = latent.detach()  # nothing below reaches the encoder, except predicted in a live context
-        recovered = self._recover(real[..., :-1, :], real[..., 1:, :], self.inverse_model_params)
+        real = latent.detach()  # no gradient for the encoder from here on, but through predicted in a live context
+        recovered = self._recover(real[..., :-1, :], real[..., 1:, :], self.inverse_model_params)  # for the inverse model
         error = inverse_error(recovered, clip.action).mean(-1)  # [B, T - 1]
         terms["loss_idm"] = self.idm_coeff * self._reduce(error, clip.mask)
-        terms |= self._judge(clip, real, predicted, recovered.action.detach())
+        terms |= self._consistency_terms(clip, real, predicted, recovered.action.detach())
         return TensorDict(terms)
 
-    def _judge(
+    def _consistency_terms(
         self, clip: Clip, real: torch.Tensor, predicted: torch.Tensor, recovered: torch.Tensor
     ) -> dict[str, torch.Tensor]:
-        """``loss_consistency`` (predictor only) and, if asked for, the detached report.
+        """``loss_consistency`` (gradient for the predictor only) and the detached diagnostics.
 
         Args:
-            clip: the clip.
-            real: detached latents [B, T, D].
-            predicted: live predictions [B, T - 1, D], used in a live context.
-            recovered: detached actions recovered from the real transitions [B, T - 1, F * A].
+            clip (Clip): the clip.
+            real (torch.Tensor): [B, T, D], detached latents.
+            predicted (torch.Tensor): [B, T - 1, D], predictions from live latents, used in a live context.
+            recovered (torch.Tensor): [B, T - 1, F * A], detached actions recovered from real transitions.
         """
-        # With buffers of its own: BatchNorm statistics of the judge are those of real transitions alone.
+        if clip.action.shape[-2] < self.consistency_steps:
+            raise ValueError(
+                f"consistency_steps={self.consistency_steps} needs clips of {self.consistency_steps + 1} frames, got "
+                f"{clip.action.shape[-2] + 1}: sample longer clips (num_frames)."
+            )
+        # With their own buffers: BatchNorm statistics of both networks move once a step, by real transitions alone.
         frozen = with_own_buffers(self.inverse_model_params).detach()
         params = with_own_buffers(self.predictor_params)
         if self.context == "detached":
@@ -163,55 +177,55 @@ class FICRegLoss(LeWMLoss):
         weight = self._weight(recovered, clip.action)
         total, count = None, None
         before, mask = real[..., :-1, :], clip.mask  # [B, T - 1, ...]
-        verdict = None
-        for step in range(self._steps(clip)):
-            if step:  # one more step deep, from one frame further on
+        imagined_action = None
+        for step in range(self.consistency_steps):
+            if step:  # one step deeper, from one frame later
                 before = predicted[..., :-1, :].detach()
                 predicted = self._predict(predicted[..., :-1, :], clip.action[..., step:, :], params)
                 mask = None if mask is None else mask[..., 1:] & mask[..., :-1]
-            judged = self._recover(before, predicted, frozen)  # [B, T - 1 - step, F * A]
-            verdict = judged.action if verdict is None else verdict
-            error = self._consistency_error(judged, target[..., step:, :], weight[..., step:, :]).mean(-1)
-            error, seen = _select(error, mask)
-            pad = (step, 0)  # transitions near the start are not reached by deep steps
-            error, seen = (torch.nn.functional.pad(value, pad) for value in (error, seen))  # [B, T - 1]
-            total, count = (error, seen) if total is None else (total + error, count + seen)
+            imagined = self._recover(before, predicted, frozen)  # [B, T - 1 - step, F * A]
+            imagined_action = imagined.action if imagined_action is None else imagined_action
+            error = self._consistency_error(imagined, target[..., step:, :], weight[..., step:, :]).mean(-1)
+            error, counted = _select(error, mask)
+            pad = (step, 0)  # deep steps do not reach transitions near the start
+            error, counted = (torch.nn.functional.pad(value, pad) for value in (error, counted))  # [B, T - 1]
+            total, count = (error, counted) if total is None else (total + error, count + counted)
         terms = {"loss_consistency": self.consistency_coeff * self._reduce(total / count.clamp_min(1), clip.mask)}
         if self.diagnostics:
-            terms |= judge_report(recovered, verdict, clip.action, clip.mask)
-            counted = None if clip.mask is None else gather_clips(clip.mask.flatten())  # [N of all processes]
-            terms["judge_trust"] = mean_where(gather_clips(weight.detach().float().flatten(0, -2)), counted)
+            terms |= inverse_model_r2(recovered, imagined_action, clip.action, clip.mask)
+            mask = None if clip.mask is None else all_gather(clip.mask.flatten())  # [N of all ranks]
+            terms["judge_trust"] = masked_mean(all_gather(weight.detach().float().flatten(0, -2)), mask)
         return terms
 
-    def _steps(self, clip: Clip) -> int:
-        if clip.action.shape[-2] < self.consistency_steps:
-            raise ValueError(
-                f"consistency_steps={self.consistency_steps} needs clips of {self.consistency_steps + 1} frames, got "
-                f"{clip.action.shape[-2] + 1}: sample longer clips (num_frames)."
-            )
-        return self.consistency_steps
-
     def _weight(self, recovered: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Weight of the judgement on every transition, [B, T - 1, F * A]; ones unless it is ``"trusted"``."""
+        """Weight of every transition, [B, T - 1, F * A]; ones unless ``consistency="trusted"``."""
         if self.consistency != "trusted":
             return torch.ones_like(action)
-        return trust(squared_error(recovered, action)).to(action.dtype)
+        return reliability_weight(squared_error(recovered, action)).to(action.dtype)
 
-    def _consistency_error(self, judged: Recovered, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    def _consistency_error(self, imagined: Recovered, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
         """[..., F * A]."""
         if self.consistency == "nll":
-            return gaussian_nll(judged.action, judged.log_var, target)
-        error = squared_error(judged.action, target)
+            if imagined.log_var is None:
+                raise self._no_likelihood()
+            return gaussian_nll(imagined.action, imagined.log_var, target)
+        error = squared_error(imagined.action, target)
         return weight * error if self.consistency == "trusted" else error
+
+    def _no_likelihood(self) -> ValueError:
+        return ValueError(
+            f"consistency='nll' needs an inverse model that writes {self.tensor_keys.recovered_action_log_var!r}: use "
+            "InverseDynamicsModel(kind='gaussian'), or name its output with loss.set_keys(recovered_action_log_var=...)."
+        )
 
 
 def _select(error: torch.Tensor, mask: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
-    """Errors with masked ones selected away, and 1 where one counts; both [B, N]."""
+    """Errors, zero where masked, and 1 where one counts; both [B, N]."""
     if mask is None:
         return error, torch.ones_like(error)
     return torch.where(mask, error, 0.0), mask.to(error.dtype)
 
 
-def _check(name: str, value: str, allowed: tuple[str, ...]) -> None:
+def _check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         raise ValueError(f"unknown {name} {value!r}: choose one of {', '.join(map(repr, allowed))}.")

@@ -1,4 +1,4 @@
-"""Prediction with an inverse model that is trained together with the encoder."""
+"""The joint inverse loss: prediction, and an inverse model trained together with the encoder."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from torchrl_ficreg.objectives.sigreg import SIGReg
 
 
 class JointInverseLoss(LeWMLoss):
-    r"""Latent prediction whose encoder is shaped by the inverse model, with or without SIGReg.
+    r"""Latent prediction with an inverse model whose error trains the encoder too, with or without SIGReg.
 
     .. math:: \|g_\phi(z_{1:t}, a_t) - z_{t+1}\|^2 + \lambda \, \mathrm{SIGReg}(Z)
               + \mu \|h_\psi(z_t, z_{t+1}) - a_t\|^2
 
-    As in ICM (arXiv 1705.05363), PLDM (arXiv 2502.14819) and sensorimotor world models (SMWM, arXiv 2606.20104): what
-    carries no trace of the action may be forgotten, so the inverse loss alone can keep the latents from collapsing
-    (``sigreg_coeff=0``, SMWM). It is the baseline that FICReg argues against: there the encoder never sees this
-    gradient.
+    As in ICM (arXiv 1705.05363), PLDM (arXiv 2502.14819) and sensorimotor world models (SMWM, arXiv 2606.20104). Latents only
+    have to keep what the actions change, and the inverse loss alone can prevent their collapse (``sigreg_coeff=0``, SMWM).
+    It is the baseline of FICReg, in which the encoder receives no gradient of this term.
 
     ====================  =======  =========  =============
     term                  encoder  predictor  inverse model
@@ -30,13 +29,18 @@ class JointInverseLoss(LeWMLoss):
     ``loss_idm``          **yes**  no         yes
     ====================  =======  =========  =============
 
-    The clip is that of :class:`~torchrl_ficreg.LeWMLoss`. With ``sigreg_coeff=0`` at construction the regulariser is
-    not computed and ``loss_sigreg`` not written.
+    Reads the clip of :class:`~torchrl_ficreg.LeWMLoss`; writes ``loss_pred``, ``loss_sigreg`` and ``loss_idm``, already
+    weighted. With ``sigreg_coeff=0`` at construction the regularizer is not computed and ``loss_sigreg`` not written.
 
     Args:
-        encoder, predictor, sigreg, sigreg_coeff, reduction, num_frames: see :class:`~torchrl_ficreg.LeWMLoss`.
-        inverse_model: see :class:`~torchrl_ficreg.FICRegLoss`.
-        idm_coeff: mu. SMWM tunes it from 0.1 to 30 by task.
+        encoder (TensorDictModule): see :class:`~torchrl_ficreg.LeWMLoss`.
+        predictor (TensorDictModule): see :class:`~torchrl_ficreg.LeWMLoss`.
+        inverse_model (TensorDictModule): see :class:`~torchrl_ficreg.FICRegLoss`.
+        sigreg (SIGReg, optional): see :class:`~torchrl_ficreg.LeWMLoss`. Default: ``None``.
+        sigreg_coeff (float, optional): lambda, see :class:`~torchrl_ficreg.LeWMLoss`. Default: ``0.09``.
+        idm_coeff (float, optional): mu; SMWM tunes it from 0.1 to 30 by task. Default: ``1.0``.
+        reduction ("mean", "sum" or "none", optional): see :class:`~torchrl_ficreg.LeWMLoss`. Default: ``"mean"``.
+        num_frames (int, optional): see :class:`~torchrl_ficreg.LeWMLoss`. Default: ``None``.
 
     Raises:
         KeyError, ValueError, TypeError: see :class:`~torchrl_ficreg.LeWMLoss`.
@@ -80,19 +84,19 @@ class JointInverseLoss(LeWMLoss):
             inverse_model=inverse_model,
         )
         self._register_coefficients(idm_coeff=idm_coeff)
-        self.regularised = self._compares_clips = sigreg_coeff > 0
-        self.out_keys = ["loss_pred", "loss_sigreg", "loss_idm"] if self.regularised else ["loss_pred", "loss_idm"]
+        self._compares_clips = sigreg_coeff > 0
+        self.out_keys = ["loss_pred", "loss_sigreg", "loss_idm"] if sigreg_coeff > 0 else ["loss_pred", "loss_idm"]
 
     @takes_clip
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
         clip = self._read(tensordict)
-        latent = self._encode(clip.pixels)  # [B, T, D]
-        predicted = self._predict(latent[..., :-1, :], clip.action, self.predictor_params)  # [B, T - 1, D]
+        latent = self._encode(clip)  # [B, T, D]; gradient for the encoder
+        predicted = self._predict(latent[..., :-1, :], clip.action, self.predictor_params)  # [B, T - 1, D]; for both
         recovered = self._recover(latent[..., :-1, :], latent[..., 1:, :], self.inverse_model_params)
         terms = {"loss_pred": self._prediction(clip, latent, predicted)}
-        if self.regularised:
-            terms["loss_sigreg"] = self.sigreg_coeff * self._spread(clip, latent)
+        if self._compares_clips:
+            terms["loss_sigreg"] = self.sigreg_coeff * self._regularizer(clip, latent)
         error = inverse_error(recovered, clip.action).mean(-1)  # [B, T - 1]
         terms["loss_idm"] = self.idm_coeff * self._reduce(error, clip.mask)
         return TensorDict(terms)

@@ -1,4 +1,4 @@
-"""The LeWorldModel objective: predict the next latent, keep the latents Gaussian."""
+"""The LeWorldModel loss: prediction of the next latent, and SIGReg."""
 
 from __future__ import annotations
 
@@ -6,51 +6,66 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
-from torchrl_ficreg.objectives.base import Clip, LatentLoss, Reduction, takes_clip
+from torchrl_ficreg.objectives.base import Clip, LatentLoss, Reduction, takes_clip, zero_term
 from torchrl_ficreg.objectives.sigreg import SIGReg
 from torchrl_ficreg.objectives.terms import squared_error
 
 
 class LeWMLoss(LatentLoss):
-    r"""LeWorldModel: end-to-end latent prediction with a Gaussian regulariser (arXiv 2603.19312).
+    r"""LeWorldModel: end-to-end latent prediction with a Gaussian regularizer (arXiv 2603.19312).
 
     .. math:: \|g_\phi(z_{1:t}, a_t) - z_{t+1}\|^2 + \lambda \, \mathrm{SIGReg}(Z), \qquad z = f_\theta(o)
 
     No stop-gradient: the target trains the encoder too.
 
-    Reads a clip [B, T]: ``pixels`` [B, T, 3, H, W], ``action`` [B, T, F * A] (z-scored blocks; block k leads from
-    frame k to k + 1, the last one is not used) and, where there is one, ``mask`` [B, T] or [B, T, 1] bool (false where a
-    block is not to be trusted: its transition, its action and the frame it leads to are left out of every term.
-    BatchNorm layers still see that frame). Two other layouts of TorchRL are read as clips: flat slices [B * T], given
-    ``num_frames``, and transitions [B] with ``("next", "pixels")``, which are clips of two frames. By keyword:
-    ``loss(pixels=, action=, mask=, next_pixels=)``, the last two optional: ``in_keys`` lists what must be there, so name the
-    mask beside them where entries are selected.
+    ====================  =======  =========
+    term                  encoder  predictor
+    ====================  =======  =========
+    ``loss_pred``         yes      yes
+    ``loss_sigreg``       yes      no
+    ====================  =======  =========
 
-    Networks are fed by the names of their ``in_keys``, in whatever order: ``latent`` or what the encoder writes,
-    ``action``, and for an inverse model ``next_latent`` or ``("next", "latent")``; the last part of a nested key counts,
-    and so do the names of :meth:`set_keys`. Keys of other names are fed by position, in the order given below.
+    Reads a clip [B, T]:
+
+    - ``pixels`` [B, T, 3, H, W];
+    - ``action`` [B, T, F * A], z-scored blocks; block k leads from frame k to k + 1, the last one is not used;
+    - ``mask`` [B, T] or [B, T, 1] bool, optional: where false, the transition, its action and the frame it leads to are left
+      out of every term. That frame still counts in the statistics of BatchNorm layers;
+    - or, in place of ``pixels``, ``latent`` [B, T, D] of a frozen encoder. The encoder is then not called and receives no
+      gradient, and ``loss_sigreg`` is zero: see :class:`~torchrl_ficreg.objectives.base.LatentLoss`.
+
+    Two other layouts of TorchRL are read as clips: flat slices [B * T], given ``num_frames``, and transitions [B] with
+    ``("next", "pixels")`` or ``("next", "latent")``, which are clips of two frames. By keyword:
+    ``loss(pixels=, action=, mask=, next_pixels=, latent=, next_latent=)``. ``in_keys`` lists ``pixels`` and ``action`` only:
+    where entries are selected by it, add the mask.
+
+    Networks are fed by the names of their ``in_keys``, in any order: ``latent`` or the output of the encoder, ``action``,
+    and for an inverse model ``next_latent`` or ``("next", "latent")``. The last part of a nested key counts, and so do the
+    names of :meth:`set_keys`. Keys of other names are fed by position, in the order of the arguments below.
 
     Writes a new tensordict: ``loss_pred`` and ``loss_sigreg``, already weighted. The sum of all entries that begin with
     ``loss_`` is the objective.
 
     To call it with other parameters, use ``with TensorDict(params).unflatten_keys(".").to_module(loss)``, where ``params``
-    holds all names of ``loss.named_parameters()``; :func:`torch.func.functional_call` is refused, as it does not reach
+    holds all names of ``loss.named_parameters()``. :func:`torch.func.functional_call` raises an error, as it does not replace
     them. :func:`torch.vmap` over data needs ``eval()`` where networks hold BatchNorm or dropout, as for any module;
     values are not checked there.
 
     Args:
-        encoder: reads ``pixels``, writes ``latent`` [..., D].
-        predictor: reads ``latent`` and ``action``, writes ``predicted_latent``.
-        sigreg: the regulariser; a default :class:`SIGReg` when None.
-        sigreg_coeff: lambda. 0.09 belongs to a batch of 128 clips.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over transitions; the regulariser is one number either way.
-        num_frames: T of flat slices [B * T], as a ``SliceSampler`` samples them; None where clips are [B, T].
+        encoder (TensorDictModule): reads ``pixels``, writes ``latent`` [..., D].
+        predictor (TensorDictModule): reads ``latent`` and ``action``, writes ``predicted_latent``.
+        sigreg (SIGReg, optional): the regularizer. Default: ``None``, a new :class:`SIGReg`.
+        sigreg_coeff (float, optional): lambda, tuned for a batch of 128 clips. Default: ``0.09``.
+        reduction ("mean", "sum" or "none", optional): over transitions; the regularizer is [] in any case. Default: ``"mean"``.
+        num_frames (int, optional): T of flat slices [B * T], as a ``SliceSampler`` samples them. Default: ``None``, clips are
+            [B, T].
+        **networks (TensorDictModule): further networks of a subclass.
 
     Raises:
         KeyError: the clip lacks a key.
-        ValueError: an unknown reduction, a negative coefficient, networks that cannot be fed, a clip of one frame,
-            a batch of one clip, clips that go on after ``("next", "done")``, or widths the networks were not built for.
-        TypeError: pixels that are neither uint8 nor floating, a plain dict for a tensordict, or a network that is no
+        ValueError: an unknown reduction, a negative coefficient, networks whose inputs cannot be told apart, a clip of one
+            frame, a batch of one clip, clips that go on after ``("next", "done")``, or widths that do not fit the networks.
+        TypeError: pixels that are neither uint8 nor floating, a plain dict instead of a tensordict, or a network that is no
             TensorDictModule.
 
     Examples:
@@ -90,23 +105,25 @@ class LeWMLoss(LatentLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
         clip = self._read(tensordict)
-        latent = self._encode(clip.pixels)  # [B, T, D]
-        predicted = self._predict(latent[..., :-1, :], clip.action, self.predictor_params)  # [B, T - 1, D]
+        latent = self._encode(clip)  # [B, T, D]; gradient for the encoder
+        predicted = self._predict(latent[..., :-1, :], clip.action, self.predictor_params)  # [B, T - 1, D]; for both
         return TensorDict(self._baseline_terms(clip, latent, predicted))
 
     def _baseline_terms(self, clip: Clip, latent: torch.Tensor, predicted: torch.Tensor) -> dict[str, torch.Tensor]:
-        """``loss_pred`` (encoder and predictor receive gradient) and ``loss_sigreg`` (encoder only)."""
+        """``loss_pred`` (gradient for encoder and predictor) and ``loss_sigreg`` (for the encoder only)."""
         return {
             "loss_pred": self._prediction(clip, latent, predicted),
-            "loss_sigreg": self.sigreg_coeff * self._spread(clip, latent),
+            "loss_sigreg": self.sigreg_coeff * self._regularizer(clip, latent),
         }
 
     def _prediction(self, clip: Clip, latent: torch.Tensor, predicted: torch.Tensor) -> torch.Tensor:
         """Error of predictions [B, T - 1, D], reduced."""
         return self._reduce(squared_error(predicted, latent[..., 1:, :]).mean(-1), clip.mask)
 
-    def _spread(self, clip: Clip, latent: torch.Tensor) -> torch.Tensor:
-        """The regulariser on the latents [B, T, D] that count."""
+    def _regularizer(self, clip: Clip, latent: torch.Tensor) -> torch.Tensor:
+        """The regularizer [] on the unmasked latents [B, T, D]; zero, without a draw, where they were given."""
+        if clip.latent is not None:
+            return zero_term(latent)
         mask = clip.frame_mask  # [B, T] or None
         mask = mask if mask is None else mask.flatten(0, -2).transpose(0, 1)  # [T, B]
         return self.sigreg(latent.flatten(0, -3).transpose(0, 1), mask)  # [T, B, D]

@@ -1,13 +1,15 @@
-"""The PLDM objective: prediction held up by variance, covariance, time and an inverse model."""
+"""The PLDM loss: prediction, variance, covariance, temporal similarity, and an inverse model."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
-from torchrl_ficreg.distributed import gather_clips
-from torchrl_ficreg.objectives.base import LatentLoss, Reduction, takes_clip
+from torchrl_ficreg.distributed import all_gather
+from torchrl_ficreg.objectives.base import Clip, LatentLoss, Reduction, takes_clip, zero_term
 from torchrl_ficreg.objectives.inverse_terms import inverse_error
 from torchrl_ficreg.objectives.terms import hinge_std, off_diagonal_covariance, squared_error
 
@@ -21,14 +23,17 @@ class PLDMLoss(LatentLoss):
     .. math:: L_{pred} + \alpha L_{var} + \beta L_{cov} + \gamma L_{time-sim} + \zeta L_{time-var}
               + \nu L_{time-cov} + \mu L_{idm}
 
-    ``loss_pred`` is that of LeWorldModel. ``loss_var`` and ``loss_cov`` are VICReg's hinge on the standard deviation
-    and penalty on covariances (arXiv 2105.04906) over the batch, at every time step; ``loss_time_var`` and
-    ``loss_time_cov`` the same over the time steps of every clip, from which the mean over the batch is subtracted at every
-    time step and no mean over time; ``loss_time_sim`` the squared difference of successive latents; ``loss_idm`` the error
-    of an inverse model trained with the encoder. Names and Greek letters are those of appendix C.2 of the LeWorldModel
-    paper (arXiv 2603.19312). Normalisation and default weights are those of the published code (stable-worldmodel, the
-    baseline of that paper): covariances are squared, as in VICReg, and averaged over the D² - D entries off the diagonal;
-    the weights belong to D = 192.
+    - ``loss_pred`` is that of LeWorldModel.
+    - ``loss_var`` and ``loss_cov`` are VICReg's hinge on the standard deviation and penalty on covariances (arXiv 2105.04906)
+      over the batch, at each time step.
+    - ``loss_time_var`` and ``loss_time_cov`` are the same over the time steps of each clip. From the latents the mean over the
+      batch is subtracted at each time step, and no mean over time.
+    - ``loss_time_sim`` is the squared difference of successive latents.
+    - ``loss_idm`` is the error of an inverse model trained with the encoder.
+
+    Names and Greek letters are those of appendix C.2 of the LeWorldModel paper (arXiv 2603.19312). Normalisation and default
+    weights are those of the published code (stable-worldmodel, the baseline of that paper): covariances are squared, as in
+    VICReg, and averaged over the D² - D entries off the diagonal. The weights are tuned for D = 192.
 
     ====================  =======  =========  =============
     term                  encoder  predictor  inverse model
@@ -42,25 +47,27 @@ class PLDMLoss(LatentLoss):
     ``loss_idm``          yes      no         yes
     ====================  =======  =========  =============
 
-    The clip is that of :class:`~torchrl_ficreg.LeWMLoss`. Masks apply to the terms on transitions (``loss_pred``,
-    ``loss_time_sim``, ``loss_idm``); the statistics see every frame. A term with weight 0 at construction is not
-    computed, whatever its weight becomes later.
+    Reads the clip of :class:`~torchrl_ficreg.LeWMLoss`; writes the seven terms, already weighted. Masks apply to the terms on
+    transitions (``loss_pred``, ``loss_time_sim``, ``loss_idm``); the statistics are those of all frames. A term with weight 0
+    at construction is neither computed nor written, whatever its weight becomes later. Where the clip holds ``latent`` in
+    place of ``pixels``, the five terms on latents alone are zero.
 
-    On several processes (``torch.distributed`` initialised), with equal shares of the clips, variance and covariance over
-    the batch are those of the global batch. Gradients follow the convention of :class:`~torchrl_ficreg.SIGReg`.
+    On several ranks of a process group, with equal local batches, variance and covariance over the batch are those of the
+    global batch. Gradients follow the convention of :class:`~torchrl_ficreg.SIGReg`.
 
     Args:
-        encoder, predictor: see :class:`~torchrl_ficreg.LeWMLoss`.
-        inverse_model: see :class:`~torchrl_ficreg.FICRegLoss`; used where ``idm_coeff`` is positive.
-        var_coeff: alpha, of the variance over the batch.
-        cov_coeff: beta, of the covariance over the batch.
-        time_sim_coeff: gamma, of temporal similarity.
-        time_var_coeff: zeta, of the variance over time; needs clips of 2 frames or more.
-        time_cov_coeff: nu, of the covariance over time.
-        idm_coeff: mu, of the inverse model; the published weight is 0.
-        std_margin: standard deviation asked for.
-        reduction: over transitions; the statistics are one number either way.
-        num_frames: see :class:`~torchrl_ficreg.LeWMLoss`.
+        encoder (TensorDictModule): see :class:`~torchrl_ficreg.LeWMLoss`.
+        predictor (TensorDictModule): see :class:`~torchrl_ficreg.LeWMLoss`.
+        inverse_model (TensorDictModule): see :class:`~torchrl_ficreg.FICRegLoss`; used where ``idm_coeff`` is positive.
+        var_coeff (float, optional): alpha, of the variance over the batch. Default: ``18.0``.
+        cov_coeff (float, optional): beta, of the covariance over the batch. Default: ``12.0``.
+        time_sim_coeff (float, optional): gamma, of temporal similarity. Default: ``0.2``.
+        time_var_coeff (float, optional): zeta, of the variance over time. Default: ``0.7``.
+        time_cov_coeff (float, optional): nu, of the covariance over time. Default: ``0.0``.
+        idm_coeff (float, optional): mu, of the inverse model. Default: ``0.0``, as published.
+        std_margin (float, optional): standard deviation below which a dimension is penalised. Default: ``1.0``.
+        reduction ("mean", "sum" or "none", optional): over transitions; the statistics are [] in any case. Default: ``"mean"``.
+        num_frames (int, optional): see :class:`~torchrl_ficreg.LeWMLoss`. Default: ``None``.
 
     Raises:
         KeyError, ValueError, TypeError: see :class:`~torchrl_ficreg.LeWMLoss`.
@@ -126,26 +133,43 @@ class PLDMLoss(LatentLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
         clip = self._read(tensordict)
-        latent = self._encode(clip.pixels)  # [B, T, D]
+        latent = self._encode(clip)  # [B, T, D]; gradient for the encoder
         before, after = latent[..., :-1, :], latent[..., 1:, :]
-        predicted = self._predict(before, clip.action, self.predictor_params)  # [B, T - 1, D]
-        over_batch = gather_clips(latent.flatten(0, -3).transpose(0, 1), dim=1)  # [T, B of all processes, D]
-        if over_batch.shape[1] < 2:
-            raise ValueError("variance and covariance over the batch need at least 2 clips, got 1: use a larger batch.")
-        centred = latent - over_batch.mean(1)  # [B, T, D], without the mean of every time step
-        pairs = max(latent.shape[-1] - 1, 1)  # entries off the diagonal for each of the D that VICReg divides by
-        compute = {
-            "loss_var": lambda: hinge_std(over_batch, -2, self.std_margin).mean(),
-            "loss_cov": lambda: off_diagonal_covariance(over_batch).mean() / pairs,
-            "loss_time_sim": lambda: self._reduce(squared_error(before, after).mean(-1), clip.mask),
-            "loss_time_var": lambda: hinge_std(centred, -2, self.std_margin).mean(),
-            "loss_time_cov": lambda: off_diagonal_covariance(centred, centre=False).mean() / pairs,
-            "loss_idm": lambda: self._reduce(
-                inverse_error(self._recover(before, after, self.inverse_model_params), clip.action).mean(-1), clip.mask
-            ),
-        }
+        predicted = self._predict(before, clip.action, self.predictor_params)  # [B, T - 1, D]; for both
+        compute = self._latent_terms(clip, latent, before, after)
+        compute["loss_idm"] = lambda: self._reduce(
+            inverse_error(self._recover(before, after, self.inverse_model_params), clip.action).mean(-1), clip.mask
+        )
         terms = {"loss_pred": self._reduce(squared_error(predicted, after).mean(-1), clip.mask)}
         for key in self.out_keys[1:]:
             weight: torch.Tensor = getattr(self, key.replace("loss_", "") + "_coeff")
             terms[key] = weight * compute[key]()
         return TensorDict(terms)
+
+    def _latent_terms(
+        self, clip: Clip, latent: torch.Tensor, before: torch.Tensor, after: torch.Tensor
+    ) -> dict[str, Callable[[], torch.Tensor]]:
+        """The terms on latents alone (encoder only), computed when called; zero where latents were given.
+
+        Args:
+            clip (Clip): the clip.
+            latent (torch.Tensor): [B, T, D].
+            before (torch.Tensor): [B, T - 1, D], all latents but the last.
+            after (torch.Tensor): [B, T - 1, D], all latents but the first.
+        """
+        if clip.latent is not None:
+            zero = zero_term(latent)
+            terms = dict.fromkeys(("loss_var", "loss_cov", "loss_time_var", "loss_time_cov"), lambda: zero)
+            return terms | {"loss_time_sim": lambda: self._reduce(zero.expand(clip.action.shape[:-1]), clip.mask)}
+        over_batch = all_gather(latent.flatten(0, -3).transpose(0, 1), dim=1)  # [T, B of all ranks, D]
+        if over_batch.shape[1] < 2:
+            raise ValueError("variance and covariance over the batch need at least 2 clips, got 1: use a larger batch.")
+        centred = latent - over_batch.mean(1)  # [B, T, D], without the mean of every time step
+        pairs = max(latent.shape[-1] - 1, 1)  # entries off the diagonal for each of the D that VICReg divides by
+        return {
+            "loss_var": lambda: hinge_std(over_batch, -2, self.std_margin).mean(),
+            "loss_cov": lambda: off_diagonal_covariance(over_batch).mean() / pairs,
+            "loss_time_sim": lambda: self._reduce(squared_error(before, after).mean(-1), clip.mask),
+            "loss_time_var": lambda: hinge_std(centred, -2, self.std_margin).mean(),
+            "loss_time_cov": lambda: off_diagonal_covariance(centred, centre=False).mean() / pairs,
+        }

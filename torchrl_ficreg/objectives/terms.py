@@ -1,4 +1,7 @@
-"""The terms of the losses as pure functions of tensors. Who receives gradient is decided by the caller."""
+"""Terms of the losses as pure functions of tensors, and three of them as modules.
+
+Gradient flows into every tensor argument; a loss detaches what must receive none.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,15 @@ import torch
 from torch import nn, Tensor
 
 
-def _widen(value: Tensor) -> Tensor:
-    """At least float32: half precision is for matrix products, not for sums of squares."""
-    return value if value.dtype == torch.float64 else value.float()
-
-
 def squared_error(prediction: Tensor, target: Tensor) -> Tensor:
-    """Squared error by dimension, at least float32: [..., C] and [..., C] -> [..., C].
+    """Squared error by dimension.
+
+    Args:
+        prediction (Tensor): [..., C].
+        target (Tensor): [..., C].
+
+    Returns:
+        Tensor: [..., C], at least float32.
 
     Raises:
         ValueError: the shapes differ; nothing is broadcast.
@@ -31,10 +36,12 @@ def gaussian_nll(mean: Tensor, log_var: Tensor, target: Tensor) -> Tensor:
     .. math:: \tfrac12 (e^{-s} (\mu - x)^2 + s), \qquad s = \log \sigma^2
 
     Args:
-        mean, log_var, target: [..., C].
+        mean (Tensor): [..., C], mu.
+        log_var (Tensor): [..., C], s.
+        target (Tensor): [..., C], x.
 
     Returns:
-        [..., C].
+        Tensor: [..., C], at least float32.
     """
     log_var = _widen(log_var)
     return 0.5 * (torch.exp(-log_var) * squared_error(mean, target) + log_var)
@@ -46,26 +53,28 @@ def hinge_std(latent: Tensor, dim: int, margin: float = 1.0, eps: float = 1e-4) 
     .. math:: \max(0, m - \sqrt{\mathrm{Var} + \epsilon})
 
     Args:
-        latent: [..., D], with at least 2 samples along ``dim``.
-        dim: of the samples.
-        margin: m.
-        eps: epsilon.
+        latent (Tensor): [..., D], with at least 2 samples along ``dim``.
+        dim (int): the dimension of the samples.
+        margin (float, optional): m. Default: ``1.0``.
+        eps (float, optional): epsilon. Default: ``1e-4``.
 
     Returns:
-        the shape of latent without ``dim``.
+        Tensor: the shape of latent without ``dim``, at least float32.
     """
     std = (_widen(latent).var(dim) + eps).sqrt()
     return (margin - std).clamp_min(0)
 
 
 def off_diagonal_covariance(latent: Tensor, *, centre: bool = True) -> Tensor:
-    """Mean over dimensions of the squared off-diagonal covariances, [..., N, D] -> [...] (arXiv 2105.04906).
-
-    The sum of squares of all off-diagonal entries divided by D.
+    """Sum of the squared off-diagonal covariances, divided by D (VICReg, arXiv 2105.04906).
 
     Args:
-        latent: [..., N, D].
-        centre: whether to subtract the mean over the N samples; without it second moments take the place of covariances.
+        latent (Tensor): [..., N, D], N samples.
+        centre (bool, optional): whether to subtract the mean over the samples; without it second moments take the place of
+            covariances. Default: ``True``.
+
+    Returns:
+        Tensor: [...], at least float32.
     """
     latent = _widen(latent)
     centred = latent - latent.mean(-2, keepdim=True) if centre else latent  # [..., N, D]
@@ -76,19 +85,28 @@ def off_diagonal_covariance(latent: Tensor, *, centre: bool = True) -> Tensor:
 
 
 def straightness(latent: Tensor) -> Tensor:
-    """Cosine between successive steps of a trajectory, [..., T, D] -> [..., T - 2]; 1 on a straight line.
+    """Cosine between successive steps of a trajectory, 1 on a straight line; 0 where a step has length zero.
 
-    A step of length zero counts as 0. See arXiv 2603.12231 on why straight latent trajectories help planning.
+    arXiv 2603.12231 gives reasons why straight latent trajectories help planning.
+
+    Args:
+        latent (Tensor): [..., T, D].
+
+    Returns:
+        Tensor: [..., T - 2], at least float32.
     """
     steps = _widen(latent).diff(dim=-2)  # [..., T - 1, D]
     return torch.nn.functional.cosine_similarity(steps[..., 1:, :], steps[..., :-1, :], dim=-1)
 
 
 class VarianceHinge(nn.Module):
-    """Keeps every latent dimension spread over the batch (VICReg, arXiv 2105.04906).
+    """Mean of :func:`hinge_std` over the batch: penalises dimensions of small variance (VICReg, arXiv 2105.04906).
 
     Args:
-        margin: standard deviation below which a dimension is pushed apart.
+        margin (float, optional): standard deviation below which a dimension is penalised. Default: ``1.0``.
+
+    Raises:
+        ValueError: a margin that is not positive, or fewer than 2 samples.
 
     Examples:
         >>> round(VarianceHinge()(torch.zeros(4, 32, 8)).item(), 4)  # collapsed: 1 - sqrt(1e-4)
@@ -108,7 +126,10 @@ class VarianceHinge(nn.Module):
 
 
 class CovariancePenalty(nn.Module):
-    """Decorrelates latent dimensions over the batch (VICReg, arXiv 2105.04906).
+    """Mean of :func:`off_diagonal_covariance`: penalises correlated dimensions (VICReg, arXiv 2105.04906).
+
+    Raises:
+        ValueError: fewer than 2 samples.
 
     Examples:
         >>> CovariancePenalty()(torch.tensor([[1.0, 1.0], [-1.0, -1.0]])).item()  # two equal dimensions
@@ -122,7 +143,10 @@ class CovariancePenalty(nn.Module):
 
 
 class TemporalStraightness(nn.Module):
-    """Mean cosine between successive latent steps: 1 on straight trajectories, 0 on random walks (arXiv 2603.12231).
+    """Mean of :func:`straightness`: 1 on straight trajectories, 0 on random walks (arXiv 2603.12231).
+
+    Raises:
+        ValueError: fewer than 3 latents.
 
     Examples:
         >>> round(TemporalStraightness()(torch.arange(5.0)[:, None] * torch.ones(3)).item(), 4)
@@ -135,6 +159,11 @@ class TemporalStraightness(nn.Module):
             shape = list(latent.shape)
             raise ValueError(f"straightness needs trajectories [..., T, D] of T >= 3 latents, got {shape}.")
         return straightness(latent).mean()
+
+
+def _widen(value: Tensor) -> Tensor:
+    """At least float32: half precision is too coarse for sums of squares."""
+    return value if value.dtype == torch.float64 else value.float()
 
 
 def _check_samples(latent: torch.Tensor) -> None:

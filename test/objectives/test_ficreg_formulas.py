@@ -1,4 +1,4 @@
-"""Values and gradients of the four terms against the published formulas, written out here once more in float64.
+"""Values and gradients of the four terms of FICReg are those of the published formulas, in float64.
 
 With z_t the latent of frame t, p_{t+1} the prediction of the next one from z_1 .. z_t and a_t, h the inverse model and
 sg[...] a constant, for clips of history + 1 = 4 frames, means over the batch, time and components::
@@ -20,7 +20,7 @@ import copy
 
 import pytest
 import torch
-from loss_collection import BLOCK, CONFIG, SIZE
+from _losses import BLOCK, CONFIG, SIZE
 from tensordict import TensorDict
 from torch import nn
 
@@ -32,7 +32,7 @@ LAMBDA, MU, GAMMA = 0.25, 0.75, 2.0  # exact in the float32 that a coefficient i
 
 @pytest.fixture
 def networks() -> dict[str, nn.Module]:
-    """Tiny ones in float64 without dropout, moved off their start values, where zeroed layers would hide a path."""
+    """Tiny ones in float64 without dropout, with all parameters off their initial values, as zeroed layers would hide a path."""
     torch.manual_seed(0)
     sizes = ModelConfig(**{**vars(CONFIG), "history": HISTORY, "predictor_dropout": 0.0})
     model, inverse_model = make_world_model(sizes, action_dim=3)
@@ -71,12 +71,12 @@ def formulas(networks: dict[str, nn.Module], clip: TensorDict, directions: torch
     before, after = latent[:, :HISTORY], latent[:, 1:]
     predicted = predictor(before, action)
     imagined = predicted if context == "live" else predictor(before.detach(), action)
-    told = torch.func.functional_call(inverse, constants, (before.detach(), imagined))
+    recovered = torch.func.functional_call(inverse, constants, (before.detach(), imagined))
     return {
         "loss_pred": (predicted - after).square().mean(),
         "loss_sigreg": LAMBDA * normality(latent, directions),
         "loss_idm": MU * (inverse(before.detach(), after.detach()) - action).square().mean(),
-        "loss_consistency": GAMMA * (told - action).square().mean(),
+        "loss_consistency": GAMMA * (recovered - action).square().mean(),
     }
 
 
@@ -113,10 +113,3 @@ def test_values_and_gradients_are_those_of_the_formulas(networks, clip, context)
             )
             for key, one, other in zip(order[name], got, wanted[name], strict=True):
                 torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-12, msg=lambda m: f"{term}, {name}.{key}: {m}")  # noqa: B023
-    reached = {
-        (term, name): any(gradient.abs().sum() > 0 for gradient in gradients(value, theirs)[name])
-        for term, value in expected.items()
-        for name in theirs
-    }
-    assert reached["loss_consistency", "encoder"] == (context == "live")
-    assert not any(reached[term, "inverse_model"] for term in expected if term != "loss_idm")

@@ -1,4 +1,4 @@
-"""Every loss of the collection around networks of a few hundred parameters, and clips of noise for them."""
+"""Every loss, and its variants, around networks of a few hundred parameters, and clips of noise for them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ PLDM = {
     "loss_idm": JOINT["loss_idm"],
 }
 
-# name: class, arguments, kind of the inverse model, who receives gradient from what
+# name: class, arguments, kind of the inverse model, which network receives gradient from which term
 COLLECTION = {
     "lewm": (LeWMLoss, {}, None, LEWM),
     "paper": (FICRegLoss, {}, "mlp", DETACHED),
@@ -63,6 +63,7 @@ COLLECTION = {
     "joint_bare": (JointInverseLoss, {"sigreg_coeff": 0.0}, "mlp", {k: JOINT[k] for k in ("loss_pred", "loss_idm")}),
     "pldm": (PLDMLoss, {"time_cov_coeff": 0.5, "idm_coeff": 1.0}, "mlp", PLDM),
 }
+LOSSES = ("lewm", "paper", "joint", "pldm")  # one of each class
 FICREG = [name for name, entry in COLLECTION.items() if entry[0] is FICRegLoss]
 
 
@@ -101,5 +102,26 @@ def make_clip(*lead: int, frames: int = 3, seed: int = 0) -> TensorDict:
 
 
 def make_mask(*lead: int, frames: int = 3) -> torch.Tensor:
-    """Some blocks of noise are not to be trusted, [*lead, frames] bool."""
+    """[*lead, frames] bool, false for some action blocks."""
     return torch.rand(*(lead or (8,)), frames, generator=torch.Generator().manual_seed(0)) > 0.4
+
+
+def call(loss: nn.Module, *args, **kwargs):
+    """One call under one seed, with the first directions of SIGReg."""
+    torch.manual_seed(0)
+    if hasattr(loss, "sigreg"):
+        loss.sigreg.generator_state[1] = 0
+    return loss(*args, **kwargs)
+
+
+def total(output: TensorDict) -> torch.Tensor:
+    """The objective: the plain sum of all terms."""
+    return sum(value.sum() for key, value in output.items() if key.startswith("loss"))
+
+
+def gradients(loss: nn.Module, clip: TensorDict, *terms: str) -> dict[str, list[torch.Tensor | None]]:
+    """Gradients of the parameters of each network from some terms, from all by default."""
+    loss.zero_grad()
+    output = call(loss, clip)
+    total(output.select(*terms) if terms else output).backward()
+    return {name: [param.grad for param in getattr(loss, name).parameters()] for name in loss._networks}

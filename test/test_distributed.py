@@ -1,4 +1,4 @@
-"""Claims about several processes: what is a statistic of the batch is one of the global batch.
+"""Claims about several ranks: statistics of a batch are those of the global batch, and a training step is that of one process.
 
 The convention is that of distributed data parallel training: gradients are averaged over ranks. So the average over
 ranks of parameter gradients, and each rank's gradient of its own latents divided by the number of ranks, must be those
@@ -14,14 +14,14 @@ import pytest
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
-from loss_collection import make_clip, make_loss
+from _losses import make_clip, make_loss
 from tensordict import TensorDict
 from torch import nn
 
 from torchrl_ficreg import SIGReg
-from torchrl_ficreg.distributed import gather_clips
+from torchrl_ficreg.distributed import all_gather
 from torchrl_ficreg.modules.layers import GlobalBatchNorm1d
-from torchrl_ficreg.trainers import LatentAlarm
+from torchrl_ficreg.trainers import CollapseMonitor
 
 TIMES, DIM, DTYPE = 3, 5, torch.float64
 SIZES = {2: {"equal": [8, 8], "unequal": [3, 13]}, 4: {"equal": [4, 4, 4, 4], "unequal": [2, 5, 3, 6]}}
@@ -81,20 +81,20 @@ def make_batch(seed: int, masked: bool) -> TensorDict:
 
 
 def gathered(rows: slice) -> dict[str, torch.Tensor]:
-    """The shares joined again, of three types, and the gradient of a statistic of the whole."""
+    """The local batches gathered, of three dtypes, and the gradient of a statistic of the global batch."""
     x = noise(3, 16, DIM)
     mine = x[:, rows].clone().requires_grad_()
-    gather_clips(mine, 1).var(1).square().sum().backward()
-    shares = {str(value.dtype): gather_clips(value[:, rows], -2) for value in (x, x.bfloat16(), x > 0)}
-    return {**shares, "gradient": mine.grad}
+    all_gather(mine, 1).var(1).square().sum().backward()
+    batches = {str(value.dtype): all_gather(value[:, rows], -2) for value in (x, x.bfloat16(), x > 0)}
+    return {**batches, "gradient": mine.grad}
 
 
 def watched(rows: slice) -> dict[str, torch.Tensor]:
-    """What the diagnostics of a loss and the alarm say of a batch, in float64."""
+    """Diagnostics of a loss, and those of CollapseMonitor, in float64."""
     loss, clip = make_loss("diagnostics", dropout=0.0, consistency="trusted").to(DTYPE), make_batch(0, masked=True)[rows]
     clip["mask"] = noise(16, 3, seed=1)[rows] > -0.5
     result = {key: value.detach() for key, value in loss(clip).items() if key.startswith("judge")}
-    alarm = LatentAlarm(1, "fp32")
+    alarm = CollapseMonitor(1, "fp32")
     alarm._trainer = SimpleNamespace(_optim_count=1, loss_module=loss)
     return result | {key: torch.tensor(value) for key, value in alarm(clip).items()}
 
@@ -113,14 +113,14 @@ def trained(name: str, rows: slice, parallel: bool, masked: bool) -> dict[str, t
 
 def scenarios(rows: dict[str, slice], world: int) -> dict[tuple, dict[str, torch.Tensor]]:
     result = {}
-    for sizes, part in rows.items():
+    for sizes, local in rows.items():
         for masked in (False, True):
             for unit in ("time", "batch_time"):
                 for dtype in (torch.float32, torch.float64):
-                    result["sigreg", sizes, masked, unit, dtype] = statistic(part, masked, unit, dtype)
+                    result["sigreg", sizes, masked, unit, dtype] = statistic(local, masked, unit, dtype)
         for kind in NORMS:
             for length in (None, 3):
-                result["norm", sizes, kind, length] = normed(part, kind, length)
+                result["norm", sizes, kind, length] = normed(local, kind, length)
     for name in STEPS if world <= 2 else ("paper",):
         result["step", name] = trained(name, rows["equal"], world > 1, masked=False)
     for name in MASKED_STEPS:
@@ -133,7 +133,7 @@ def work(rank: int, world: int, folder: str) -> None:
     warnings.simplefilter("ignore")
     warnings.filterwarnings("error", r"torch\.distributed")  # deprecated functions
     torch.set_num_threads(1)
-    dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=world)
+    dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=world)
     try:
         rows = {}
         for name, sizes in SIZES[world].items():
@@ -147,13 +147,13 @@ def work(rank: int, world: int, folder: str) -> None:
 
 @pytest.fixture(scope="module")
 def single():
-    """What one process makes of the whole batch."""
+    """Results of one process on the global batch."""
     return scenarios({"equal": slice(None), "unequal": slice(None)}, 1)
 
 
 @pytest.fixture(scope="module", params=[2, pytest.param(4, marks=pytest.mark.slow)])
 def ranks(request, tmp_path_factory):
-    """What each of the processes makes of its part."""
+    """Results of each rank on its local batch."""
     folder = str(tmp_path_factory.mktemp("ranks"))
     mp.spawn(work, args=(request.param, folder), nprocs=request.param)
     return [torch.load(f"{folder}/{rank}.pt", weights_only=False) for rank in range(request.param)]
@@ -168,15 +168,15 @@ def relative(ours: torch.Tensor, expected: torch.Tensor) -> float:
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("sizes", ["equal", "unequal"])
 def test_sigreg_is_that_of_the_global_batch(ranks, single, sizes, masked, unit, dtype):
-    """Value and gradients within 1e-5 (float64: 1e-12), whatever the parts, and the same directions ever after."""
+    """Value and gradients within 1e-5 (float64: 1e-12), whatever the sizes of local batches, and the same state."""
     key = ("sigreg", sizes, masked, unit, dtype)
     tolerance = 1e-5 if dtype == torch.float32 else 1e-12
-    expected, parts = single[key], [rank[key] for rank in ranks]
-    for part in parts:
-        assert relative(part["value"], expected["value"]) < tolerance
-        assert part["state"].equal(expected["state"])
-    assert relative(sum(part["weight"] for part in parts) / len(parts), expected["weight"]) < tolerance
-    latent = torch.cat([part["latent"] for part in parts], 1) / len(parts)
+    expected, results = single[key], [rank[key] for rank in ranks]
+    for result in results:
+        assert relative(result["value"], expected["value"]) < tolerance
+        assert result["state"].equal(expected["state"])
+    assert relative(sum(result["weight"] for result in results) / len(results), expected["weight"]) < tolerance
+    latent = torch.cat([result["latent"] for result in results], 1) / len(results)
     assert relative(latent, expected["latent"]) < tolerance
 
 
@@ -186,17 +186,17 @@ def test_sigreg_is_that_of_the_global_batch(ranks, single, sizes, masked, unit, 
 def test_batch_norm_is_that_of_the_global_batch(ranks, single, sizes, kind, length):
     """Outputs, running statistics and gradients; the loss here is a sum over samples, so gradients add up."""
     key = ("norm", sizes, kind, length)
-    expected, parts = single[key], [rank[key] for rank in ranks]
+    expected, results = single[key], [rank[key] for rank in ranks]
     for name, value in expected.items():
         if name.startswith(("output", "input")):
-            ours = torch.cat([part[name] for part in parts])
+            ours = torch.cat([result[name] for result in results])
         elif name in ("weight", "bias"):
-            ours = sum(part[name] for part in parts)
+            ours = sum(result[name] for result in results)
         else:
             if name == "eval" and kind == "stateless":
-                continue  # every rank normalises what all of them see, here the same batch as many times
-            assert all(part[name].equal(parts[0][name]) for part in parts), name
-            ours = parts[0][name]
+                continue  # the same batch on every rank
+            assert all(result[name].equal(results[0][name]) for result in results), name
+            ours = results[0][name]
         torch.testing.assert_close(ours, value, rtol=1e-10, atol=1e-12, msg=lambda text, name=name: f"{name}: {text}")
 
 
@@ -209,8 +209,8 @@ def test_training_steps_are_those_of_one_process_on_the_whole_batch(ranks, singl
 
 
 @pytest.mark.parametrize("name", MASKED_STEPS)
-def test_masks_may_leave_more_transitions_on_one_process_than_on_another(ranks, single, name):
-    """Here none at all on the first half of the processes: the steps are still those of one process."""
+def test_masks_may_leave_more_transitions_on_one_rank_than_on_another(ranks, single, name):
+    """Here none at all on the first half of the ranks: the steps are still those of one process."""
     check_step(ranks, single, ("masked step", name))
 
 
@@ -225,18 +225,18 @@ def check_step(ranks, single, key):
             assert value.allclose(expected[entry], rtol=1e-9, atol=1e-9), entry
 
 
-def test_gathered_shares_are_the_batch_again(ranks, single):
-    """To the last bit, on every process; the average of gradients is that of one process."""
-    expected, parts = single["gathered",], [rank["gathered",] for rank in ranks]
-    gradient = torch.cat([part.pop("gradient") for part in parts], 1) / len(parts)
+def test_gathered_local_batches_are_the_global_batch(ranks, single):
+    """To the last bit, on every rank; the average of gradients is that of one process."""
+    expected, results = single["gathered",], [rank["gathered",] for rank in ranks]
+    gradient = torch.cat([result.pop("gradient") for result in results], 1) / len(results)
     torch.testing.assert_close(gradient, expected["gradient"], rtol=1e-12, atol=1e-14)
-    for part in parts:
-        assert len(part) == 3
-        assert all(value.equal(expected[dtype]) for dtype, value in part.items())
+    for result in results:
+        assert len(result) == 3
+        assert all(value.equal(expected[dtype]) for dtype, value in result.items())
 
 
 def test_diagnostics_are_those_of_the_global_batch(ranks, single):
-    """R² of the judge, how far it is trusted, and the state of the latents: the same numbers on every process."""
+    """R² and reliability of the inverse model, and the measures of collapse: the same numbers on every rank."""
     expected = single["watched",]
     assert len(expected) == 7
     for rank in ranks:

@@ -1,8 +1,9 @@
-"""Claims about the choice of precision: it is measured here, kept, said, and convolutions are judged apart."""
+"""Claims about the device: precision follows a measurement, convolutions have their own; freed memory is reused."""
 
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -13,23 +14,30 @@ from torch import nn
 from torch._subclasses import FakeTensorMode
 
 from torchrl_ficreg import _device as precision, ConvEncoder, KeypointEncoder, ViTEncoder
-from torchrl_ficreg._device import autocast, bf16_speedup, describe_precision, has_fast_bf16, uses_bf16
+from torchrl_ficreg._device import (
+    autocast,
+    bf16_speedup,
+    describe_precision,
+    has_fast_bf16,
+    keep_freed_memory,
+    uses_bf16,
+)
 
 
 @pytest.fixture
 def speeds(monkeypatch):
-    """Sets what was measured, as ``{kind: times float32}``."""
+    """``speeds(products, convolutions)`` sets the measured speedups."""
 
-    def pretend(products: float, convolutions: float) -> None:
+    def set_speeds(products: float, convolutions: float) -> None:
         known = {"products": products, "convolutions": convolutions}
         monkeypatch.setattr(precision, "bf16_speedup", lambda kind="products": known[kind])
 
-    return pretend
+    return set_speeds
 
 
 @pytest.fixture
 def unmeasured(monkeypatch):
-    """As in a process that has measured nothing yet."""
+    """A process that has measured nothing yet."""
     monkeypatch.setattr(precision, "_speedups", {})
 
 
@@ -63,7 +71,7 @@ CONTEXTS = {
 @pytest.mark.parametrize("kind", ["products", "convolutions"])
 @pytest.mark.parametrize("context", CONTEXTS)
 def test_it_can_be_measured_first_wherever_it_is_asked_for(unmeasured, monkeypatch, context, kind):
-    """On real tensors, whatever the tensors of the caller are."""
+    """On real tensors, whatever kind of tensors the caller uses."""
     measure, seen = precision._measure, []
 
     def watched(kind):
@@ -162,3 +170,24 @@ def test_a_vision_transformer_gives_the_same_latents_by_every_path(grad, chosen)
         latent = encoder(pixels=pixels).detach().float()
     tolerance = 1e-5 if chosen == "fp32" else 5e-2 * expected.abs().max().item()
     torch.testing.assert_close(latent, expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a setting of glibc")
+def test_freed_memory_is_reused_and_a_smaller_setting_does_not_undo_a_larger_one(monkeypatch):
+    """Counted in page faults: fresh memory has one per page, or per huge page."""
+    monkeypatch.setattr(precision, "_largest_kept", 0)
+
+    def faults() -> int:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(8):
+            torch.ones(2**23)  # 32 MiB
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+    if not keep_freed_memory(2**20, allow_decrease=True):
+        pytest.skip("another C library")
+    fresh = faults()
+    keep_freed_memory(2**31 - 1)
+    faults()
+    assert faults() < fresh / 4
+    keep_freed_memory(2**20)
+    assert faults() < fresh / 4

@@ -1,13 +1,17 @@
-"""The smallest run that has everything a real one has: dropout, BatchNorm, an inverse model, validation, a card."""
+"""A tiny run with all parts of a real one: dropout, BatchNorm, an inverse model, validation, a card."""
 
 from __future__ import annotations
 
+import csv
 import math
-from dataclasses import asdict
+import zipfile
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from torchrl.checkpoint import Checkpoint
 
 from torchrl_ficreg import FICRegLoss, LeWMLoss, make_world_model, ModelConfig
 from torchrl_ficreg.data import OfflineTrajectories
@@ -31,6 +35,7 @@ SIZES = ModelConfig(
     predictor_dropout=0.1,
     inverse_hidden_dim=8,
 )
+STILL = replace(SIZES, predictor_dropout=0.0)  # without dropout
 LOW, HIGH = [-4.0, -4.0], [4.0, 4.0]
 
 
@@ -62,7 +67,7 @@ def make_trainer(
     sizes: ModelConfig = SIZES,
     **settings,
 ) -> OfflineTrainer:
-    """A trainer of three epochs that a second call with the same arguments makes again, weight for weight."""
+    """A trainer of three epochs, with the same initial weights at every call."""
     data = make_data() if data is None else data
     torch.manual_seed(0)
     model, inverse_model = make_world_model(sizes, action_dim=2)
@@ -100,7 +105,7 @@ def finite(tensors: dict[str, torch.Tensor]) -> bool:
 
 
 def run(run_dir: Path, weights_file: Path) -> None:
-    """One start of the command: continues where the last one was killed, then leaves its weights."""
+    """One start of a command: continues after the last checkpoint, and saves the final weights."""
     trainer = make_trainer(run_dir, data=make_data(prefetch=1), epochs=6)
     trainer.resume()
     with open(weights_file.with_suffix(".starts"), "a") as file:
@@ -111,10 +116,63 @@ def run(run_dir: Path, weights_file: Path) -> None:
     part.rename(weights_file)
 
 
-def run_until_told(run_dir: Path) -> None:
-    """A long run that stops when it is told to; says, by a file, from which step on it listens."""
+def run_until_signalled(run_dir: Path) -> None:
+    """A long run that stops on SIGTERM; a file named after its first step says that the handler is installed."""
     trainer = make_trainer(run_dir, data=make_data(prefetch=1), validate=False, epochs=60)
     trainer.resume()
     with stop_on_signal(trainer):
-        run_dir.with_name(f"listens{trainer.step}").touch()
+        run_dir.with_name(f"ready{trainer.step}").touch()
         trainer.train()
+
+
+def table(run_dir: Path, split: str | None = None) -> list[dict[str, str]]:
+    """Rows of the metrics, of one split or of all."""
+    with open(run_dir / "metrics.csv", newline="") as file:
+        return [row for row in csv.DictReader(file) if split in (None, row["split"])]
+
+
+def logged_steps(run_dir: Path, split: str = "train") -> list[int]:
+    """Steps that have a row."""
+    return [int(row["step"]) for row in table(run_dir, split)]
+
+
+def at_step(trainer: OfflineTrainer, step: int, action: Callable[[], object]) -> None:
+    """Calls ``action`` after a step."""
+    trainer.register_op("post_steps", lambda: action() if trainer.step == step else None)
+
+
+def watch_updates(trainer: OfflineTrainer, what: Callable[[], object]) -> list:
+    """Collects ``what()`` right before every update of the optimizer."""
+    seen = []
+    trainer.optimizer.register_step_pre_hook(lambda *_: seen.append(what()))
+    return seen
+
+
+def snapshot(folder: Path) -> dict[Path, bytes]:
+    """Content of every file."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def half_written(run_dir: Path) -> set[str]:
+    """Names of what a process left behind that was killed while it wrote a checkpoint."""
+    return {path.name for path in (run_dir / "checkpoints").glob(".*")}
+
+
+def damage(path: Path, how: str) -> None:
+    data = bytearray(path.read_bytes())
+    if how == "truncated":
+        path.write_bytes(data[: len(data) // 2])
+    elif how == "flipped":  # every 97th byte of the payloads; the zip's directory at the end stays readable
+        with zipfile.ZipFile(path) as archive:
+            end, manifest = archive.start_dir, archive.getinfo("manifest.json")
+        for at in range(200, min(end, manifest.header_offset), 97):
+            data[at] ^= 0xFF
+        path.write_bytes(data)
+    elif how == "without the card":
+        with zipfile.ZipFile(path) as archive:
+            kept = [(info, archive.read(info)) for info in archive.infolist() if "card" not in info.filename]
+        with zipfile.ZipFile(path, "w") as archive:
+            for info, content in kept:
+                archive.writestr(info, content)
+    else:
+        Checkpoint(something={"else": 1}).save(path, format="archive")

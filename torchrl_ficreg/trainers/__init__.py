@@ -3,27 +3,26 @@
 from torchrl_ficreg.trainers.checkpoint import checkpoint_components, find_checkpoint, load_world_model
 from torchrl_ficreg.trainers.hooks import (
     CoefficientSchedule,
-    LatentAlarm,
-    Meter,
+    CollapseMonitor,
+    EvaluationHook,
     MetricsTable,
     Progress,
-    SuccessRate,
+    Throughput,
     Validation,
 )
 from torchrl_ficreg.trainers.loggers import TolerantLogger
 from torchrl_ficreg.trainers.offline import OfflineTrainer, WarmupCosine
-from torchrl_ficreg.trainers.refinement import LatentsAsFrames, NoRegularizer, on_frozen_latents, Refinement
+from torchrl_ficreg.trainers.refinement import Refinement
 from torchrl_ficreg.trainers.signals import exit_on_signal, Preempted, PREEMPTED, stop_on_signal
 from torchrl_ficreg.trainers.stepper import OfflineStepper
-from torchrl_ficreg.trainers.stream import ReadError
+from torchrl_ficreg.trainers.stream import ClipBuffer, ReadError
 
 __all__ = [
+    "ClipBuffer",
     "CoefficientSchedule",
-    "LatentAlarm",
-    "LatentsAsFrames",
-    "Meter",
+    "CollapseMonitor",
+    "EvaluationHook",
     "MetricsTable",
-    "NoRegularizer",
     "OfflineStepper",
     "OfflineTrainer",
     "PREEMPTED",
@@ -31,7 +30,7 @@ __all__ = [
     "Progress",
     "ReadError",
     "Refinement",
-    "SuccessRate",
+    "Throughput",
     "TolerantLogger",
     "Validation",
     "WarmupCosine",
@@ -39,6 +38,5 @@ __all__ = [
     "exit_on_signal",
     "find_checkpoint",
     "load_world_model",
-    "on_frozen_latents",
     "stop_on_signal",
 ]

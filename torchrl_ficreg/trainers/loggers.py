@@ -1,4 +1,4 @@
-"""Loggers: a CSV table on disk, and a wrapper under which a lost logger does not end the run."""
+"""Loggers: a CSV table on disk, and a wrapper that keeps a run going when a TorchRL logger fails or hangs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import io
 import os
 import queue
 import re
-import sys
 import threading
 import time
 import weakref
@@ -18,10 +17,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.utils._pytree import tree_map
 from torchrl import torchrl_logger
 from torchrl.record.loggers import Logger
 
+from torchrl_ficreg._torchrl_compat import disconnect_wandb, tree_map, unhook_wandb
 from torchrl_ficreg._utils import BINARY, NO_FOLLOW, NO_WAIT, read_bytes, write_all, write_atomic
 
 
@@ -29,14 +28,14 @@ _STEP = re.compile(r"\d{1,18}", re.ASCII)
 
 
 class CsvRows:
-    """Appends rows to a CSV file. A row may bring new columns: the file is then rewritten, in one piece, with them.
+    """Appends rows to a CSV file. A row may have new columns: the file is then rewritten atomically.
 
-    When the disk is full, or the file cannot be written for another reason, a warning is given once, what was written
-    of the row is taken back, and rows wait in memory until there is room again.
+    While the file cannot be written, for example because the disk is full, rows wait in memory. It warns once, and
+    removes what was written of an incomplete row.
 
     Args:
-        path: the file; made, with its folder, by the first row.
-        first: columns that come first, whether or not a row has them yet.
+        path (Path): the file. The first row creates it and its folder.
+        first (Iterable[str], optional): columns that come first, whether or not a row has them. Default: ``()``.
 
     Examples:
         >>> import tempfile
@@ -48,13 +47,14 @@ class CsvRows:
     """
 
     def __init__(self, path: Path, first: Iterable[str] = ()) -> None:
-        self.path, self._first = path, tuple(first)
+        self.path = path
+        self._first = tuple(first)
         self._columns: list[str] | None = None
         self._waiting: list[dict[str, Any]] = []
         self._warned = False
 
     def append(self, row: dict[str, Any]) -> None:
-        """Writes a row, and those that waited for room."""
+        """Writes a row, and those that wait in memory."""
         self._waiting.append(row)
         try:
             self._flush()
@@ -79,7 +79,7 @@ class CsvRows:
         self._columns, self._waiting = columns, []
 
     def _header(self) -> list[str] | None:
-        """Columns of the file; None where there is no file, or none with a header."""
+        """Columns of the file; None without a file or a header."""
         if self._columns is None and self.path.exists():
             self._columns = _read(self.path)[0] or None
         return self._columns if self.path.exists() else None
@@ -88,15 +88,15 @@ class CsvRows:
         write_atomic(self.path, _lines(columns, [dict(zip(columns, columns)), *rows]))
 
     def drop_after(self, step: int) -> None:
-        """Removes whole rows of later steps, and torn or damaged ones of any, in one piece.
+        """Removes rows of later steps, and incomplete or damaged rows, atomically.
 
         Raises:
-            ValueError: the header is damaged, or there is no regular file.
+            ValueError: the header is damaged, or the path is not a regular file.
         """
         self._columns, self._waiting = None, []
         if not self.path.exists():
             return
-        header, rows = _read(self.path)  # a kill may leave an empty file
+        header, rows = _read(self.path)  # a killed process may leave an empty file
         whole = [row for row in rows if len(row) == len(header) and _STEP.fullmatch(row[0])]
         kept = [dict(zip(header, row)) for row in whole if int(row[0]) <= step]
         if kept:
@@ -106,10 +106,10 @@ class CsvRows:
 
 
 def _read(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a table; rows that cannot be read are left out.
+    """Header and rows of a table, without the rows that cannot be parsed.
 
     Raises:
-        ValueError: the header cannot be read, or there is no regular file.
+        ValueError: the header cannot be parsed, or the path is not a regular file.
     """
     first, *lines = read_bytes(path).decode(errors="replace").split("\n")
     try:
@@ -146,24 +146,27 @@ def _append(path: Path, text: str) -> None:
 
 
 class TolerantLogger:
-    """Passes every call on to a TorchRL logger until one fails or hangs, then warns once and passes on no more.
+    """Forwards calls to a TorchRL logger until one fails or hangs; then warns once and drops all further calls.
 
-    A server that cannot be reached, one that no longer answers, or a full disk below its files must not end or hold up a
-    training of days: ``metrics.csv`` has the same numbers. Calls are made one after another by a daemon thread, so they
-    return None at once; a call made by another one, in that thread, is made in its place. Arrays and tensors are copied.
+    An unreachable server, one that no longer answers, or a full disk must not stop or block a training of days:
+    ``metrics.csv`` has the same numbers. A daemon thread makes the calls in order, so they return None at once; a call
+    made inside another one, in that thread, is executed directly. Tensors and arrays are copied.
 
-    Nor does a checkpoint depend on a logger: this one has no state, so that a run may continue with another logger or none.
+    It has no state, so that a run may continue with another logger or none.
 
     Args:
-        logger: any; what is not a method is read from it as before.
-        timeout: seconds after which a call in progress counts as hung, and that :meth:`flush` waits at most.
-        max_calls: calls that may wait; when there are more, the next one waits for room, up to ``timeout``.
+        logger (Logger): any logger. Attributes that are not methods are read from it directly.
+
+    Keyword Args:
+        timeout (float, optional): seconds after which a call counts as hung, and that :meth:`flush` waits at most.
+            Default: ``60.0``.
+        max_calls (int, optional): calls that may be queued; a further one waits, up to ``timeout``. Default: ``1000``.
 
     Attributes:
-        lost: whether it has failed or hung.
+        lost (bool): whether the logger has failed or hung.
 
     Raises:
-        ValueError: timeout or max_calls are not positive.
+        ValueError: ``timeout`` or ``max_calls`` is not positive.
 
     Examples:
         >>> class Server:
@@ -181,30 +184,36 @@ class TolerantLogger:
     def __init__(self, logger: Logger, *, timeout: float = 60.0, max_calls: int = 1000) -> None:
         if not timeout > 0 or max_calls < 1:
             raise ValueError(f"timeout and max_calls must be positive, got {timeout} and {max_calls}.")
-        self._logger, self._timeout, self.lost = logger, timeout, False
+        self._logger = logger
+        self._timeout = timeout
+        self.lost = False
         self._calls: queue.Queue[tuple] = queue.Queue(max_calls)
         self._worker: threading.Thread | None = None
-        self._began: float | None = None  # when the call in progress did
-        self._telling = threading.Lock()
-        _unhook_wandb()
-        atexit.register(_flush, weakref.ref(self))  # runs before what the logger's package registered earlier
+        self._began: float | None = None  # time at which the current call began
+        self._warning = threading.Lock()
+        unhook_wandb()
+        atexit.register(_flush, weakref.ref(self))  # runs before the exit handlers that the logger's package registered
 
     @classmethod
     def around(cls, logger: Logger | TolerantLogger | None) -> TolerantLogger | None:
-        """Makes a logger tolerant that is not yet."""
+        """Wraps a logger, unless it is None or wrapped already."""
         return logger if logger is None or isinstance(logger, cls) else cls(logger)
 
     def __getattr__(self, name: str) -> Any:
-        if name == "_logger":  # of a copy that is being made
+        if name == "_logger":  # while copying, before it is set
             raise AttributeError(name)
         value = getattr(self._logger, name)
         return self._guard(value) if callable(value) and not name.startswith("_") else value
 
     def attempt(self, work: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """Has a function that talks to the logger's backend called under the same rule, after the calls before it.
+        """Queues a call of a function that uses the logger's backend, under the same rules as the logger's own methods.
+
+        Args:
+            work (Callable): the function.
+            *args, **kwargs: its arguments.
 
         Returns:
-            None; inside a call in progress, what the function returns.
+            None; inside another call, the result of the function.
         """
         if threading.current_thread() is self._worker:
             return self._call(work, args, kwargs)
@@ -221,10 +230,10 @@ class TolerantLogger:
             self._hung()
 
     def flush(self, timeout: float | None = None) -> None:
-        """Waits until every call so far was made.
+        """Waits until all queued calls were made.
 
         Args:
-            timeout: most seconds to wait, after which the logger counts as hung; None: that of the class.
+            timeout (float, optional): seconds after which the logger counts as hung. Default: that of the logger.
         """
         deadline = time.monotonic() + (self._timeout if timeout is None else timeout)
         with self._calls.all_tasks_done:
@@ -235,7 +244,7 @@ class TolerantLogger:
             self._hung()
 
     def shutdown(self, *args: Any, **kwargs: Any) -> None:
-        """Closes the logger after all calls so far, and waits for that as :meth:`flush` does."""
+        """Closes the logger after all queued calls, and waits as :meth:`flush` does."""
         self.attempt(self._logger.shutdown, *args, **kwargs)
         self.flush()
 
@@ -254,16 +263,16 @@ class TolerantLogger:
             return None
         try:
             return work(*args, **kwargs)
-        except BaseException as error:  # of any kind: what a backend raises is its own affair, and the thread must live on
+        except BaseException as error:  # whatever a backend raises, the thread must not end
             self._lose(f"{type(error).__name__}: {error}")
 
     def _hung(self) -> None:
         if not self.lost:
             self._lose(f"no answer within {self._timeout:g} s")
-            _leave_wandb()
+            disconnect_wandb()
 
     def _lose(self, reason: str) -> None:
-        with self._telling:
+        with self._warning:
             if self.lost:
                 return
             self.lost = True
@@ -277,31 +286,13 @@ class TolerantLogger:
 
 
 def _copy(value: Any) -> Any:
-    """A tensor or an array that its owner may overwrite before the call is made."""
+    """Copies a tensor or an array, which its owner may overwrite before the call is made."""
     if isinstance(value, torch.Tensor):
         return value.detach().clone()
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
 def _flush(logger: weakref.ref[TolerantLogger]) -> None:
-    """At exit, where a daemon thread would end in the middle of its calls."""
+    """Runs at exit, where the daemon thread would end in the middle of a call."""
     if (alive := logger()) is not None:
         alive.flush()
-
-
-def _unhook_wandb() -> None:
-    """Has no import report to wandb's service: when that is gone, the import would fail, in whatever thread it is."""
-    hooks = sys.modules.get("wandb.sdk.lib.import_hooks")
-    if hooks is not None:
-        hooks.unregister_all_post_import_hooks()
-
-
-def _leave_wandb() -> None:
-    """Has the exit of this process not wait for a wandb service that does not answer.
-
-    The service ends by itself when its parent is gone. Nothing public does this; another version of wandb waits.
-    """
-    setup = getattr(sys.modules.get("wandb.sdk.wandb_setup"), "_singleton", None)
-    forget = getattr(getattr(setup, "_connection", None), "_cleanup", None)  # unregisters wandb's own exit handler
-    if callable(forget):
-        forget()

@@ -1,4 +1,4 @@
-"""Trains a world model from stored clips, with TorchRL's trainer."""
+"""Trains a world model on recorded clips, with TorchRL's trainer."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import math
 import os
 import shutil
 import time
-from collections import defaultdict, deque
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,160 +14,134 @@ import torch
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from torchrl.objectives.common import LossModule
 from torchrl.record.loggers import Logger
-from torchrl.trainers import Trainer
 from torchrl.trainers.trainers import LRSchedulerHook
 
 from torchrl_ficreg._device import keep_freed_memory, Precision
-from torchrl_ficreg.data import OfflineTrajectories
-from torchrl_ficreg.distributed import from_main, is_main, rank, wait_for_all, world_size
+from torchrl_ficreg._torchrl_compat import BaseTrainer, HALF_WRITTEN
+from torchrl_ficreg.distributed import barrier, broadcast_from_rank0, is_main, rank, world_size
 from torchrl_ficreg.trainers.checkpoint import (
     check_members,
-    check_room,
     CHECKPOINTS,
     DAMAGES,
-    latest_whole,
+    latest_intact,
     RandomState,
-    set_odd_aside,
-    sweep_unpacked,
+    remove_old_unpacked,
+    require_checkpoint_space,
+    set_unreadable_aside,
 )
-from torchrl_ficreg.trainers.hooks import Meter, MetricsTable, Progress, Validation
+from torchrl_ficreg.trainers.hooks import MetricsTable, Progress, Throughput, Validation
 from torchrl_ficreg.trainers.loggers import TolerantLogger
-from torchrl_ficreg.trainers.stepper import OfflineStepper, parallelise, Strategy
-from torchrl_ficreg.trainers.stream import ReadError, ReplayStream
-
-
-class Clock:
-    """Wall time spent in training, over all lives of a run."""
-
-    def __init__(self) -> None:
-        self._before, self._began = 0.0, None
-
-    @property
-    def seconds(self) -> float:
-        """Seconds so far."""
-        return self._before + (time.perf_counter() - self._began if self._began is not None else 0.0)
-
-    def start(self) -> None:
-        """Begins to count."""
-        self._began = time.perf_counter()
-
-    def stop(self) -> None:
-        """Ceases to count."""
-        self._before, self._began = self.seconds, None
-
-    def state_dict(self) -> dict[str, float]:
-        """The seconds so far."""
-        return {"seconds": self.seconds}
-
-    def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """Continues from there."""
-        self._before = float(state_dict["seconds"])
-
-
-class WarmupCosine:
-    """Factor of the learning rate: linear from 0 over the warm-up, then a cosine to 0 at the last step.
-
-    Args:
-        steps: of the whole schedule, which a run may leave before its end.
-        warmup: share of them in which the factor rises.
-
-    Examples:
-        >>> factor = WarmupCosine(steps=100, warmup=0.1)
-        >>> factor(0), factor(9), round(factor(100), 6)
-        (0.1, 1.0, 0.0)
-    """
-
-    def __init__(self, steps: int, warmup: float) -> None:
-        self.steps, self.rise = steps, max(1, round(warmup * steps))
-
-    def __call__(self, step: int) -> float:
-        """Factor of the update after ``step`` updates."""
-        if step < self.rise:
-            return (step + 1) / self.rise
-        return 0.5 * (1 + math.cos(math.pi * (step - self.rise) / max(1, self.steps - self.rise)))
-
+from torchrl_ficreg.trainers.stepper import DistributedLoss, OfflineStepper
+from torchrl_ficreg.trainers.stream import ClipBuffer, ReadError, ReplayStream
 
 METRICS = "metrics.csv"
-_KEPT = 100  # latest numbers of each kind in memory, for hooks such as TorchRL's EarlyStopping; all are in metrics.csv
 
 
-class OfflineTrainer(Trainer):
-    """A :class:`torchrl.trainers.Trainer` that is fed by a replay buffer of clips.
+class OfflineTrainer(BaseTrainer):
+    """A :class:`torchrl.trainers.Trainer` that samples clips from a replay buffer.
 
-    One AdamW for everything, gradient clipping, linear warm-up and a cosine to zero over the exact number of steps,
-    bfloat16 autocast where the device is good at it. TorchRL's hooks register on it as on any trainer; a *frame* in
-    their settings (``wait_for``, ``patience``) is one stored frame of a clip, batch x T of them a step.
+    One AdamW over all parameters, gradient clipping, a linear warm-up and a cosine to zero over the exact number of
+    steps, and bfloat16 autocast where the device is fast at it. TorchRL's hooks register on it as on any trainer; a
+    *frame* in their settings (``wait_for``, ``patience``) is one stored frame of a clip, and a step takes B x T of them.
 
-    With a ``run_dir`` it writes ``metrics.csv`` and, after every epoch, a checkpoint below ``checkpoints/``. Each is
-    published by one atomic rename and the previous one is kept until then: a kill at any instant leaves a loadable
-    one. :meth:`resume` continues from the latest, and on one device a resumed run ends with the very weights of an
-    unbroken one: optimiser, schedule, random state and the position in the data are part of a checkpoint.
+    With a ``run_dir`` it writes ``metrics.csv`` and, after every epoch, a checkpoint below ``checkpoints/``. A checkpoint
+    is published by one atomic rename, and the previous one is kept until then, so that a process killed at any time
+    leaves a loadable one. :meth:`resume` continues from the latest. On one device, a resumed run ends with bitwise the
+    weights of an unbroken one: a checkpoint holds optimizer state, schedule, random state and the position in the data.
 
-    What goes wrong on the way, and what happens then; the checkpoints already there are never touched:
+    Behaviour on failure; existing checkpoints are never changed:
 
     ========================================  =====================================================================
-    a loss or gradient is not finite          stops, ``FloatingPointError``; no weight is updated
-    a batch cannot be read                    stops, :class:`ReadError`; a single process writes a checkpoint first
-    a file of the dataset vanishes            warns and goes on (the mapping still holds it); shorter: cannot be read
-    no room for a checkpoint                  stops, ``OSError``
-    no room for ``metrics.csv``               warns and goes on; rows wait in memory until there is room
-    the logger fails or hangs                 warns and goes on without it
+    a loss or gradient is not finite          stops with ``FloatingPointError``; no weight is updated
+    a batch cannot be read                    stops with :class:`ReadError`; a single process writes a checkpoint first
+    a file of the dataset was deleted         warns and continues (the mapping still holds it)
+    a file of the dataset was truncated       as a batch that cannot be read
+    no space for a checkpoint                 stops with ``OSError``
+    no space for ``metrics.csv``              warns and continues; rows wait in memory until there is space
+    the logger fails or hangs                 warns and continues without it
     SIGTERM, inside :class:`stop_on_signal`   writes a checkpoint after the step and exits with code 85; SIGINT: 130
-    SIGKILL, a crash, a power cut             continues from the last checkpoint when started again
+    SIGKILL, a crash, a power failure         continues from the last checkpoint when started again
     the newest checkpoint is damaged          warns and continues from the one before
     ``train()`` without ``resume()``          ``ValueError`` where the folder holds checkpoints
     ========================================  =====================================================================
 
     Args:
-        loss_module: a loss such as :class:`~torchrl_ficreg.FICRegLoss`, already on its device.
-        replay_buffer: training clips, in whole batches (``drop_last``).
-        epochs: passes over all clips.
-        schedule_epochs: length of the learning rate's schedule, in epochs and at least ``epochs``; None: ``epochs``. A run
-            that ends earlier than its schedule ends at a rate above zero.
-        keep_epoch: epoch whose checkpoint stays, as ``checkpoints/epoch-<n>.torchrl``, whatever comes later; None: none.
-        lr, weight_decay: of AdamW.
-        warmup: share of the schedule in which the learning rate rises from zero.
-        clip_norm: largest gradient norm.
-        precision: see :func:`~torchrl_ficreg._device.autocast`.
-        run_dir: folder for metrics and checkpoints; None writes nothing.
-        components: more things to put into a checkpoint, by name: anything with a ``state_dict``, or JSON values.
-        validation_buffer: clips of held-out episodes, evaluated after every epoch.
-        validation_batches: batches of them to average over.
-        log_interval: steps between rows of ``metrics.csv``.
-        logger: a TorchRL logger that receives the same numbers.
-        progress_bar: show one.
-        strategy: of several processes, ``"ddp"`` or ``"fsdp"``; see :mod:`~torchrl_ficreg.trainers.stepper`.
-        accumulate: parts of a batch that are learned from one after another; see :class:`OfflineStepper`.
-        compile: the loss, by ``torch.compile``.
+        loss_module (LossModule): a loss such as :class:`~torchrl_ficreg.FICRegLoss`, on its device.
+        replay_buffer (ClipBuffer): training clips in whole batches (``drop_last``), such as
+            :class:`~torchrl_ficreg.data.OfflineTrajectories`; :class:`~torchrl_ficreg.trainers.stream.ClipBuffer` lists
+            what another replay buffer needs.
+
+    Keyword Args:
+        epochs (int): passes over all clips.
+        schedule_epochs (int, optional): length of the learning-rate schedule in epochs, at least ``epochs``. A run that
+            ends before its schedule ends with a learning rate above zero. Default: ``None``, ``epochs``.
+        lr (float, optional): peak learning rate of AdamW. Default: ``5e-5``.
+        weight_decay (float, optional): of AdamW. Default: ``1e-3``.
+        warmup (float, optional): fraction of the schedule in which the learning rate rises, in [0, 1).
+            Default: ``0.01``.
+        clip_norm (float, optional): largest norm of the gradient of all parameters. Default: ``1.0``.
+        accumulate (int, optional): micro-batches that a batch is split into; see :class:`OfflineStepper`.
+            Default: ``1``.
+        precision (str, optional): see :func:`~torchrl_ficreg._device.autocast`. Default: ``"auto"``.
+        compile (bool, optional): compile the loss with ``torch.compile``. Default: ``False``.
+        run_dir (path, optional): folder for metrics and checkpoints. Default: ``None``, nothing is written.
+        components (dict, optional): name -> further components of a checkpoint: objects with a ``state_dict``, or JSON
+            values. Default: ``None``.
+        keep_epoch (int, optional): epoch whose checkpoint is kept for good, as ``checkpoints/epoch-<n>.torchrl``.
+            Default: ``None``.
+        validation_buffer (ClipBuffer, optional): clips of held-out episodes, evaluated after every epoch.
+            Default: ``None``.
+        validation_batches (int, optional): batches of them to average over. Default: ``4``.
+        log_interval (int, optional): steps between rows of ``metrics.csv``. Default: ``10``.
+        logger (Logger, optional): TorchRL logger that receives the same numbers. Default: ``None``.
+        progress_bar (bool, optional): show a progress bar. Default: ``True``.
 
     Raises:
-        FloatingPointError: a loss stopped being finite, see :class:`OfflineStepper`.
-        ValueError: a setting outside its range, or a buffer that serves incomplete batches.
+        ValueError: an argument is out of range, the buffer serves incomplete batches or those of another rank, or the
+            loss is not a mean.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_ficreg import LeWMLoss, make_world_model, ModelConfig
+        >>> from torchrl_ficreg.data import OfflineTrajectories
+        >>> rng = np.random.default_rng(0)
+        >>> episode = {
+        ...     "pixels": rng.integers(0, 256, (12, 3, 64, 64), dtype=np.uint8),
+        ...     "action": np.pad(rng.normal(size=(11, 2)), ((0, 1), (0, 0))).astype(np.float32),
+        ...     "state": np.zeros((12, 1)),
+        ... }
+        >>> clips = OfflineTrajectories.from_episodes(
+        ...     [episode] * 2, split="all", num_frames=2, frame_skip=5, batch_size=4
+        ... )
+        >>> model, _ = make_world_model(ModelConfig.preset("cpu", history=1), action_dim=2)
+        >>> trainer = OfflineTrainer(LeWMLoss(model.encoder, model.predictor), clips, epochs=1, progress_bar=False)
+        >>> trainer.train()
+        >>> trainer.step, trainer.total_steps
+        (3, 3)
     """
 
     def __init__(
         self,
         loss_module: LossModule,
-        replay_buffer: OfflineTrajectories,
+        replay_buffer: ClipBuffer,
         *,
         epochs: int,
         schedule_epochs: int | None = None,
-        keep_epoch: int | None = None,
         lr: float = 5e-5,
         weight_decay: float = 1e-3,
         warmup: float = 0.01,
         clip_norm: float = 1.0,
+        accumulate: int = 1,
         precision: Precision = "auto",
+        compile: bool = False,
         run_dir: Path | str | None = None,
         components: dict[str, Any] | None = None,
-        validation_buffer: OfflineTrajectories | None = None,
+        keep_epoch: int | None = None,
+        validation_buffer: ClipBuffer | None = None,
         validation_batches: int = 4,
         log_interval: int = 10,
         logger: Logger | None = None,
         progress_bar: bool = True,
-        strategy: Strategy = "ddp",
-        accumulate: int = 1,
-        compile: bool = False,
     ) -> None:
         if epochs < 1 or lr <= 0 or weight_decay < 0 or clip_norm <= 0 or not 0 <= warmup < 1 or log_interval < 1:
             raise ValueError(
@@ -182,39 +154,48 @@ class OfflineTrainer(Trainer):
             raise ValueError(f"keep_epoch must lie between 1 and epochs={epochs}, or be None, got {keep_epoch}.")
         if validation_buffer is not None and validation_batches < 1:
             raise ValueError(f"validation_batches must be positive, got {validation_batches}.")
-        if accumulate < 1 or replay_buffer.batch_size % (2 * accumulate) and accumulate > 1:
+        batch_size = replay_buffer.batch_size
+        if accumulate < 1 or batch_size % (2 * accumulate) and accumulate > 1:
             raise ValueError(
-                f"accumulate={accumulate} must cut the {replay_buffer.batch_size} clips of a batch into equal parts of "
-                "at least 2."
+                f"accumulate={accumulate} must cut the {batch_size} clips of a batch into equal parts of at least 2."
             )
-        self.steps_per_epoch = replay_buffer.batches_per_epoch
-        if self.steps_per_epoch * replay_buffer.batch_size > len(replay_buffer):
-            raise ValueError("the last batch of an epoch is incomplete: make the training buffer with drop_last=True.")
         reduction = getattr(loss_module, "reduction", "mean")
-        if reduction != "mean":  # a sum would be divided by accumulate and by the number of processes
+        if reduction != "mean":  # a sum would be divided by accumulate and by the number of ranks
             raise ValueError(
-                f"the trainer averages losses over the parts of a batch and over processes, which needs reduction='mean', got "
-                f"{reduction!r}: build the loss with 'mean'."
+                "the trainer averages losses over the parts of a batch and over processes, which needs reduction='mean', "
+                f"got {reduction!r}: build the loss with 'mean'."
             )
-        self.total_steps, self._resumed = epochs * self.steps_per_epoch, False
+        stream = ReplayStream(replay_buffer, next(loss_module.parameters()).device)
+        if stream.batches_per_epoch * batch_size > len(replay_buffer):
+            raise ValueError("the last batch of an epoch is incomplete: make the training buffer with drop_last=True.")
+        for buffer in (replay_buffer, validation_buffer):
+            _check_rank(buffer)
+        self.steps_per_epoch = stream.batches_per_epoch
+        self.total_steps = epochs * self.steps_per_epoch
         self.schedule_steps = (schedule_epochs or epochs) * self.steps_per_epoch
         self.keep_epoch = keep_epoch
-        frames = replay_buffer.batch_size * replay_buffer.num_frames  # of one step
-        self._check_parts(replay_buffer, validation_buffer)
-        self.parallel = parallelise(loss_module, strategy, compile)
-        params = self.parallel.params
-        if params[0].device.type == "cpu":
-            keep_freed_memory(2**31 - 1)  # the activations of a step, which the next one needs again
-        stream = ReplayStream(replay_buffer, params[0].device)
-        meter = Meter(replay_buffer.batch_size, lambda: stream.waited, params[0].device)
+        self._resumed = False
+        self.distributed_loss = DistributedLoss(loss_module, compile)
+        if stream.device.type == "cpu":
+            keep_freed_memory(2**31 - 1)  # the activations of a step, which the next step allocates again
+        throughput = Throughput(batch_size, lambda: stream.waited, stream.device)
         metrics = None if run_dir is None or not is_main() else Path(run_dir) / METRICS
-        self.metrics_table = MetricsTable(metrics, log_interval, self.total_steps, meter)
-        optimizer = torch.optim.AdamW(params, lr=lr, weight_decay=weight_decay, fused=params[0].device.type != "mps")
-        rotation = None if run_dir is None else CheckpointRotation(Path(run_dir) / CHECKPOINTS, keep_last=2)
+        self.metrics_table = MetricsTable(metrics, log_interval, self.total_steps, throughput)
+        optimizer = torch.optim.AdamW(
+            [p for p in loss_module.parameters() if p.requires_grad],
+            lr=lr,
+            weight_decay=weight_decay,
+            fused=stream.device.type != "mps",
+        )
+        checkpoint = rotation = None
+        if run_dir is not None:
+            checkpoint = Checkpoint(format="archive", rng=RandomState(stream.device), **(components or {}))
+            rotation = CheckpointRotation(Path(run_dir) / CHECKPOINTS, keep_last=2)
+        frames = batch_size * stream.num_frames  # of one step
         super().__init__(
             collector=stream,
             total_frames=self.total_steps * frames,
-            frame_skip=world_size(),  # so that frames count over all processes
+            frame_skip=world_size(),  # counts frames over all ranks
             optim_steps_per_batch=1,
             loss_module=loss_module.train(),
             optimizer=optimizer,
@@ -222,20 +203,14 @@ class OfflineTrainer(Trainer):
             progress_bar=False,
             auto_log_optim_steps=False,
             log_interval=0,
-            save_trainer_interval=self.steps_per_epoch * frames - 1,  # the comparison is strict
-            checkpoint=(
-                None
-                if run_dir is None
-                else Checkpoint(format="archive", rng=RandomState(params[0].device), **(components or {}))
-            ),
+            save_trainer_interval=self.steps_per_epoch * frames - 1,  # TorchRL saves above the interval, not at it
+            checkpoint=checkpoint,
             checkpoint_rotation=rotation,
+            logger=TolerantLogger.around(logger) if is_main() else None,
         )
-        self._log_dict = defaultdict(partial(deque, maxlen=_KEPT))
-        self._checkpoint_skip_warnings.add("logger")  # it has no state, on purpose
-        self.logger = TolerantLogger.around(logger) if is_main() else None
         self.schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, WarmupCosine(self.schedule_steps, warmup))
         LRSchedulerHook(self.schedule, interval="optim").register(self)
-        self.clock = Clock()
+        self.clock = ElapsedTime()
         self.register_module("clock", self.clock)
         self.metrics_table.register(self)
         if validation_buffer is not None:
@@ -244,43 +219,59 @@ class OfflineTrainer(Trainer):
         if progress_bar and is_main():
             Progress(self.total_steps, log_interval).register(self)
 
-    @staticmethod
-    def _check_parts(*buffers: OfflineTrajectories | None) -> None:
-        for part in (buffer.part for buffer in buffers if buffer is not None):
-            if part != (rank(), world_size()):
-                raise ValueError(
-                    f"process {rank()} of {world_size()} was given a dataset with part={part}: make its datasets with "
-                    "part=(rank(), world_size())."
-                )
-
-    @property
-    def step(self) -> int:
-        """Optimisation steps taken."""
-        return self._optim_count
-
-    def resume(self, start: Path | str | None = None) -> bool:
-        """Loads the latest checkpoint of the run, if there is one, and says whether anything was loaded.
-
-        Args:
-            start: a checkpoint, of another run say, to begin from where the run has none yet.
+    def train(self) -> None:
+        """Trains to the last step; returns at once where a resumed run had reached it.
 
         Raises:
-            FileNotFoundError: the run is past ``keep_epoch``, and that epoch's checkpoint was not kept.
+            FloatingPointError: a loss or a gradient is not finite.
+            OSError: a checkpoint cannot be written.
+            ReadError: a batch cannot be read.
+            ValueError: the run has checkpoints, and :meth:`resume` was not called.
+        """
+        rotation, begun = self.checkpoint_rotation, self.step > 0 or self._resumed
+        if rotation is not None and not begun and any(rotation.directory.glob(f"{rotation.prefix}-*")):
+            raise ValueError(
+                f"{rotation.directory} holds checkpoints of a run: call resume() before train() to continue it, or "
+                "give another run_dir."
+            )
+        if self.step >= self.total_steps:
+            return
+        self.clock.start()
+        try:
+            super().train()
+        except ReadError:
+            if world_size() == 1:  # the other ranks have begun the next step
+                self.save_trainer(force_save=True)
+            raise
+        self.clock.stop()
+        if isinstance(self.logger, TolerantLogger):
+            self.logger.flush()
+
+    def resume(self, start: Path | str | None = None) -> bool:
+        """Loads the latest checkpoint of the run, if there is one.
+
+        Args:
+            start (path, optional): a checkpoint, for example of another run, to load where the run has none.
+                Default: ``None``.
+
+        Returns:
+            whether a checkpoint was loaded.
+
+        Raises:
+            FileNotFoundError: the run is past ``keep_epoch``, and the checkpoint of that epoch was not kept.
             ValueError: the checkpoint is damaged, or belongs to other networks, data or hooks.
         """
         rotation, latest = self.checkpoint_rotation, None
         if rotation is not None:
-            latest = latest_whole(rotation)
+            latest = latest_intact(rotation)
             if is_main():
-                set_odd_aside(rotation)
-        latest = from_main(start if latest is None else latest)
+                set_unreadable_aside(rotation)
+        latest = broadcast_from_rank0(start if latest is None else latest)
         if latest is not None:
             check_members(latest)
-            sweep_unpacked()
+            remove_old_unpacked()
             try:
-                checkpoint = Checkpoint() if self.checkpoint is None else self.checkpoint
-                # Every component takes its tensors to its own device; the one they came from may not exist here.
-                self._sync_checkpoint_components(checkpoint).load(latest, map_location="cpu")
+                self.load_checkpoint(latest)
             except DAMAGES as error:
                 raise ValueError(
                     f"{latest} cannot be continued ({error}): repeat the settings it was made with, or, if it is "
@@ -292,45 +283,43 @@ class OfflineTrainer(Trainer):
                     f"{latest} was scheduled for {planned} steps, not {self.schedule_steps}: the learning rate has "
                     "fallen accordingly. Repeat its epochs, schedule_epochs and batch size, or begin another run."
                 )
-            self.parallel.restored(self.optimizer)
-            _align(self.optimizer)
-            self._keep(latest)  # the process may have been killed between the checkpoint and this
+            _match_strides(self.optimizer)
+            self._keep(latest)  # the process may have been killed between the checkpoint and its copy
         self._resumed = True
-        self._sweep()
+        self._remove_half_written()
         self.metrics_table.drop_after(self.step)
         return latest is not None
 
-    def _save_trainer(self) -> None:
-        """Saves, when :meth:`save_trainer` finds that a checkpoint is due.
+    def write_checkpoint(self) -> None:
+        """Writes a checkpoint on rank 0, while the other ranks wait; :meth:`save_trainer` calls it where one is due.
 
         Raises:
-            OSError: it cannot be written, for want of room say. The checkpoints already there stay as they are.
+            OSError: it cannot be written, for example for want of space. Existing checkpoints stay as they are.
         """
-        with self.parallel.whole(self.optimizer):
-            if is_main():
+        if is_main():
+            if self.checkpoint_rotation is not None:
+                require_checkpoint_space(self.checkpoint_rotation.directory, self.loss_module.parameters())
+            try:
+                super().write_checkpoint()
                 if self.checkpoint_rotation is not None:
-                    check_room(self.checkpoint_rotation.directory, self.loss_module.parameters())
-                try:
-                    super()._save_trainer()
-                    if self.checkpoint_rotation is not None:
-                        self._keep(self.checkpoint_rotation.latest())
-                except (OSError, RuntimeError) as error:
-                    advice = "make room; " if _is_full(error) else ""
-                    raise OSError(
-                        f"the checkpoint of step {self.step} cannot be written ({error}): {advice}the same command "
-                        "continues from the last one."
-                    ) from error
-            wait_for_all()  # a process that ended meanwhile would have torchrun stop the writer too
+                    self._keep(self.checkpoint_rotation.latest())
+            except (OSError, RuntimeError) as error:
+                advice = "make room; " if _is_full(error) else ""
+                raise OSError(
+                    f"the checkpoint of step {self.step} cannot be written ({error}): {advice}the same command "
+                    "continues from the last one."
+                ) from error
+        barrier()  # torchrun would stop rank 0 while it writes, if another rank ended
 
     @property
     def kept(self) -> Path | None:
-        """Where the checkpoint of ``keep_epoch`` is, or will be."""
+        """Path of the checkpoint of ``keep_epoch``, whether or not it exists yet."""
         if self.keep_epoch is None or self.checkpoint_rotation is None:
             return None
         return self.checkpoint_rotation.directory / f"epoch-{self.keep_epoch}.torchrl"
 
     def _keep(self, checkpoint: Path) -> None:
-        """Keeps a checkpoint beside the rotation, which does not touch it, where it is that of ``keep_epoch``."""
+        """Copies the checkpoint of ``keep_epoch`` to a name that the rotation leaves alone; ignores other epochs."""
         if self.kept is None or self.kept.exists() or not is_main():
             return
         end = self.keep_epoch * self.steps_per_epoch
@@ -342,56 +331,103 @@ class OfflineTrainer(Trainer):
         if self.step == end:
             self.kept.parent.mkdir(parents=True, exist_ok=True)
             part = self.kept.with_name(f".{self.kept.name}.part")
-            part.unlink(missing_ok=True)  # of a process that was killed, or a link, through which nothing is written
+            part.unlink(missing_ok=True)  # of a killed process, or a link, which copyfile would follow
             shutil.copyfile(checkpoint, part)
             os.replace(part, self.kept)
 
-    def _sweep(self) -> None:
+    def _remove_half_written(self) -> None:
         """Removes what a killed process left half-written beside its checkpoints."""
         if self.checkpoint_rotation is None or not is_main():
             return
-        for pattern in (".*.stage-*", ".*.archive-*", ".*.delete-*"):
+        for pattern in HALF_WRITTEN:
             for left in self.checkpoint_rotation.directory.glob(pattern):
                 shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
 
-    def train(self) -> None:
-        """Runs to the end, or not at all when the resumed run had reached it.
 
-        Raises:
-            ValueError: there are checkpoints of a run, and :meth:`resume` was not called.
-        """
-        rotation, begun = self.checkpoint_rotation, self.step > 0 or self._resumed
-        if rotation is not None and not begun and any(rotation.directory.glob(f"{rotation.prefix}-*")):
-            raise ValueError(
-                f"{rotation.directory} holds checkpoints of a run: call resume() before train() to continue it, or "
-                "give another run_dir."
-            )
-        if self.step < self.total_steps:
-            self.clock.start()
-            try:
-                super().train()
-            except ReadError:
-                if world_size() == 1:  # the other processes are at work on the next batch already
-                    self.save_trainer(force_save=True)
-                raise
-            self.clock.stop()
-            if isinstance(self.logger, TolerantLogger):
-                self.logger.flush()
-        self.parallel.finished(self.optimizer)
+class WarmupCosine:
+    """Learning-rate factor for ``LambdaLR``: linear warm-up from zero, then a cosine to zero at the last step.
+
+    Its attributes are part of a checkpoint, as the state of the ``LambdaLR``.
+
+    Args:
+        steps (int): optimization steps of the whole schedule. A run may end before.
+        warmup (float): fraction of the steps in which the factor rises, in [0, 1).
+
+    Examples:
+        >>> factor = WarmupCosine(steps=100, warmup=0.1)
+        >>> factor(0), factor(9), round(factor(100), 6)
+        (0.1, 1.0, 0.0)
+    """
+
+    def __init__(self, steps: int, warmup: float) -> None:
+        self.steps = steps
+        self.rise = max(1, round(warmup * steps))
+
+    def __call__(self, step: int) -> float:
+        """Factor of the update that follows ``step`` updates."""
+        if step < self.rise:
+            return (step + 1) / self.rise
+        return 0.5 * (1 + math.cos(math.pi * (step - self.rise) / max(1, self.steps - self.rise)))
+
+
+class ElapsedTime:
+    """Wall-clock training time in seconds, accumulated across restarts of a run.
+
+    Examples:
+        >>> elapsed = ElapsedTime()
+        >>> elapsed.load_state_dict({"seconds": 60.0})
+        >>> elapsed.seconds
+        60.0
+    """
+
+    def __init__(self) -> None:
+        self._before = 0.0
+        self._began: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        """Seconds so far."""
+        return self._before + (time.perf_counter() - self._began if self._began is not None else 0.0)
+
+    def start(self) -> None:
+        """Starts the timer."""
+        self._began = time.perf_counter()
+
+    def stop(self) -> None:
+        """Stops the timer."""
+        self._before, self._began = self.seconds, None
+
+    def state_dict(self) -> dict[str, float]:
+        """``seconds``."""
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Continues from ``seconds``."""
+        self._before = float(state_dict["seconds"])
+
+
+def _check_rank(buffer: ClipBuffer | None) -> None:
+    sampler = getattr(buffer, "sampler", None)
+    got = (getattr(sampler, "rank", 0), getattr(sampler, "world_size", 1))
+    if buffer is not None and got != (rank(), world_size()):
+        raise ValueError(
+            f"rank {rank()} of {world_size()} was given a dataset of rank {got[0]} of {got[1]}: make its datasets with "
+            "rank=rank(), world_size=world_size()."
+        )
 
 
 def _is_full(error: OSError | RuntimeError) -> bool:
-    """Whether a disk, a quota or the largest size of a file was exceeded; PyTorch's archives tell it in words only."""
+    """Whether a disk, a quota or the largest file size was exceeded; PyTorch's archives say so in the message only."""
     if isinstance(error, OSError):
         return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     return "writ" in str(error)
 
 
-def _align(optimizer: torch.optim.Optimizer) -> None:
-    """Lays loaded moments out in memory as their parameters are.
+def _match_strides(optimizer: torch.optim.Optimizer) -> None:
+    """Gives a loaded optimizer state the strides of its parameters.
 
-    A checkpoint keeps values, not strides, and the fused AdamW walks over raw memory: beside a channels-last weight,
-    contiguous moments would meet the wrong elements.
+    A checkpoint holds values, not strides, and the fused AdamW runs over raw memory: with a channels-last weight and a
+    contiguous moment it would combine elements of different positions.
     """
     for parameter, state in optimizer.state.items():
         for key, value in state.items():

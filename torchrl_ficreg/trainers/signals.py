@@ -1,4 +1,4 @@
-"""A job that is told to make room (SIGTERM), or is interrupted (Ctrl-C), stops at the next step, in good order."""
+"""Preemption: on SIGTERM or SIGINT, writes a checkpoint after the current step and exits."""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ from types import FrameType
 
 from torchrl.trainers import Trainer
 
-from torchrl_ficreg.distributed import any_process, together
+from torchrl_ficreg._torchrl_compat import stop_reason
+from torchrl_ficreg.distributed import any_rank, world_size
 
-# Told apart from success, from an error (1) and from a death by the signal (143): start the same command again. It is
-# the number that HTCondor takes for "wrote a checkpoint", and that a SLURM script can ask for before
-# `scontrol requeue`. Under torchrun the launcher itself exits with 1.
+# Exit code for "start the same command again", distinct from success, an error (1) and death by the signal (143).
+# HTCondor reads it as "wrote a checkpoint"; a SLURM script can test for it before `scontrol requeue`.
 PREEMPTED = 85
-_INTERRUPTED = 128 + signal.SIGINT  # what a shell shows for a command that Ctrl-C ended
+_INTERRUPTED = 128 + signal.SIGINT  # what a shell reports for a command that Ctrl-C ended
 
 
 class Preempted(SystemExit):
-    """Ends the process in good order; what it was doing continues when the command is repeated.
+    """Ends the process after a signal; the same command continues.
 
     The exit code is :data:`PREEMPTED`, 85, and 130 after SIGINT. Under torchrun the launcher itself exits with 1.
 
     Args:
-        signum: the signal received.
-        resumes: bool, whether the same command continues, rather than starting over; it only changes the message.
-            Default: True.
+        signum (int): the signal received.
+        resumes (bool, optional): whether the same command continues, rather than starting over; it only changes the
+            message. Default: ``True``.
     """
 
     def __init__(self, signum: int, resumes: bool = True) -> None:
         super().__init__(_INTERRUPTED if signum == signal.SIGINT else PREEMPTED)
-        self.signal, self.resumes = signal.Signals(signum), resumes
+        self.signal = signal.Signals(signum)
+        self.resumes = resumes
 
     def __str__(self) -> str:
         then = "continues where it stopped" if self.resumes else "starts over"
@@ -39,19 +40,20 @@ class Preempted(SystemExit):
 
 
 class _Handler:
-    """Installs itself for some signals, in the main thread, between ``__enter__`` and ``__exit__``.
+    """Context that handles some signals in the main thread. Subclasses define :meth:`_handle`.
 
-    A signal that the process ignores stays ignored: shells have their background jobs ignore SIGINT.
+    A signal that the process ignores stays ignored: shells start background jobs with SIGINT ignored.
     """
 
     def __init__(self, signals: tuple[int, ...]) -> None:
-        self._signals, self._before = signals, {}
+        self._signals = signals
+        self._before: dict[int, object] = {}
 
     def __enter__(self) -> _Handler:
         self._pid = os.getpid()
         if threading.current_thread() is threading.main_thread():  # Python allows handlers nowhere else
-            heard = [number for number in self._signals if signal.getsignal(number) is not signal.SIG_IGN]
-            self._before = {number: signal.signal(number, self._receive) for number in heard}
+            handled = [number for number in self._signals if signal.getsignal(number) is not signal.SIG_IGN]
+            self._before = {number: signal.signal(number, self._receive) for number in handled}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -60,7 +62,7 @@ class _Handler:
         self._before = {}
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        if os.getpid() != self._pid:  # a forked worker inherits the handler, but ends when it is told to
+        if os.getpid() != self._pid:  # a forked worker inherits the handler; the signal shall end it
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
             return
@@ -71,11 +73,11 @@ class _Handler:
 
 
 class exit_on_signal(_Handler):  # noqa: N801 (reads as a statement, like contextlib's)
-    """Context: a signal raises :class:`Preempted` where the process happens to be, so that ``finally`` clauses run.
+    """Context: a signal raises :class:`Preempted` at the current line, so that ``finally`` clauses run.
 
     Args:
-        *signals: SIGTERM unless told otherwise.
-        resumes: bool, see :class:`Preempted`. Default: True.
+        *signals (int): the signals. Default: SIGTERM.
+        resumes (bool, optional): see :class:`Preempted`. Default: ``True``.
 
     Examples:
         >>> with exit_on_signal():
@@ -94,38 +96,39 @@ class exit_on_signal(_Handler):  # noqa: N801 (reads as a statement, like contex
 
 
 class stop_on_signal(_Handler):  # noqa: N801
-    """Context around :meth:`OfflineTrainer.train`: on a signal the step in progress ends, and a checkpoint is written.
+    """Context around :meth:`OfflineTrainer.train`: on a signal the current step ends and a checkpoint is written.
 
-    Where several processes train, all of them stop after the same step, whichever received the signal first. Among the
-    signals may be SIGINT: a second Ctrl-C then stops a process on its own at once.
+    With several ranks all stop after the same step, whichever received the signal. With SIGINT among the signals, a
+    second Ctrl-C stops a single process at once.
 
     Args:
-        trainer: to be stopped.
-        *signals: SIGTERM unless told otherwise.
+        trainer (Trainer): to be stopped.
+        *signals (int): the signals. Default: SIGTERM.
 
     Raises:
-        Preempted: on leaving, when a signal was received. Nothing is raised in its place where training failed.
+        Preempted: on exit, if a signal was received. An exception of the training is raised instead.
         KeyboardInterrupt: at once, at a second SIGINT.
     """
 
     def __init__(self, trainer: Trainer, *signals: int) -> None:
         super().__init__(signals or (signal.SIGTERM,))
-        self._trainer, self._received = trainer, 0
-        self._alone = not together()
+        self._trainer = trainer
+        self._received = 0
+        self._alone = world_size() == 1
         if not self._alone:
-            trainer.register_op("post_steps", self._agree)
+            trainer.register_op("post_steps", self._synchronize)
 
     def _handle(self, number: int) -> None:
-        # torchrun passes on a Ctrl-C that its processes have received already, so that among them two may be one.
+        # torchrun forwards a Ctrl-C that its processes have received already: with several ranks, two may be one.
         if self._alone and number == self._received == signal.SIGINT:
             raise KeyboardInterrupt
         self._received = number
         if self._alone:
             self._trainer.request_stop(signal.Signals(number).name)
 
-    def _agree(self) -> None:
+    def _synchronize(self) -> None:
         device = next(self._trainer.loss_module.parameters()).device
-        if any_process(self._received != 0, device):
+        if any_rank(self._received != 0, device):
             self._received = self._received or self._signals[0]
             self._trainer.request_stop(signal.Signals(self._received).name)
 
@@ -135,6 +138,6 @@ class stop_on_signal(_Handler):  # noqa: N801
             raise Preempted(self._received)
 
 
-def told_to_stop(trainer: Trainer) -> bool:
-    """Whether a signal has asked the trainer to stop after this step: time is short then."""
-    return trainer._stop_training and trainer._stop_reason in signal.Signals.__members__
+def stop_requested(trainer: Trainer) -> bool:
+    """Whether a signal has asked the trainer to stop after this step. Little time remains then."""
+    return stop_reason(trainer) in signal.Signals.__members__

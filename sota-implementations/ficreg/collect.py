@@ -1,18 +1,18 @@
-"""Records expert episodes: python collect.py env=two_room. Run again after an interruption, it continues."""
+"""Records expert episodes: python collect.py env=two_room. The same command continues an interrupted recording."""
 
 from __future__ import annotations
 
 from cli import entry_point
-from episodes import collect_dataset
+from configs import check_settings
 from omegaconf import DictConfig
-from utils import check_settings
+from utils import collect_dataset
 
 from torchrl_ficreg.data import OfflineTrajectories
 
 
 @entry_point("collect")
 def main(cfg: DictConfig) -> None:
-    """Records what is missing and says what is there."""
+    """Records missing episodes and prints the number of all."""
     check_settings(cfg, training=False)
     path = collect_dataset(cfg)
     dataset = OfflineTrajectories(path, split="all", num_frames=2, frame_skip=1)

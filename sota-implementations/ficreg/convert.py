@@ -1,6 +1,6 @@
-"""Turns other people's data into a dataset: python convert.py source=pusht_expert_train.h5 target=data/pusht env=push_t.
+"""Converts episodes of other formats: python convert.py source=pusht_expert_train.h5 target=data/pusht env=push_t.
 
-Run again after an interruption, it continues.
+The same command continues an interrupted conversion.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from torchrl_ficreg.data.convert import convert, open_source, TASKS
 
 @entry_point("convert")
 def main(cfg: DictConfig) -> None:
-    """Converts what is missing and says what is there."""
+    """Converts missing episodes and prints the number of all."""
     if missing := sorted(OmegaConf.missing_keys(cfg)):
         raise ValueError(f"name {' and '.join(missing)}: source=pusht_expert_train.h5 target=data/pusht, say.")
-    # One line without the source of the warning, which is ours.
+    # One line, without the source line of the warning.
     warnings.showwarning = lambda message, *_: print(f"warning: {message}")
-    if cfg.env_name and "env" in cfg:
+    if cfg.env_name and cfg.env is not None:
         raise ValueError(f"env_name={cfg.env_name} is for environments other than env={cfg.env.name}: give one of them.")
     if (cfg.action_low is None) != (cfg.action_high is None):
         raise ValueError("give both action_low and action_high, or none of them.")
-    task = OmegaConf.to_container(cfg.env) if "env" in cfg else {"name": cfg.env_name, "kwargs": {}}
+    task = OmegaConf.to_container(cfg.env) if cfg.env is not None else {"name": cfg.env_name, "kwargs": {}}
     state = list(cfg.state) if isinstance(cfg.state, ListConfig) else cfg.state
     with open_source(
         cfg.source,

@@ -1,7 +1,7 @@
 """Evaluates a trained model: python evaluate.py checkpoint=runs/two_room_cpu_ficreg_seed0 plan=icem.
 
-Each evaluation has a folder of its own beside the run, <run>/evaluation/<search>_<hash of the settings>; the table shows
-all of them.
+Each evaluation has its own folder in the run directory, <run>/evaluation/<search>_<hash of the settings>; the printed
+table shows all of them.
 """
 
 from __future__ import annotations
@@ -14,20 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from cli import entry_point
+from configs import check_consistency, check_horizon
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from planning import check_consistency, check_horizon, make_policy, plan_config
-from utils import (
-    claim_folder,
-    evaluate_beside_random,
-    flatten,
-    get_device,
-    report,
-    result_rows,
-    settings_of_card,
-    versions,
-    write_json,
-)
+from results import evaluate_with_random_baseline, report, result_rows
+from run_dir import claim_folder, flatten, versions, write_json
+from utils import get_device, make_policy, plan_config, settings_of_card
 
 from torchrl_ficreg._safe_files import checksum_of
 from torchrl_ficreg._utils import read_json, write_atomic
@@ -36,12 +28,12 @@ from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_
 
 RESULTS = "results.json"
 SHARED = ("checkpoint", "weights", "pairs", "budget")  # settings besides the plan
-LARGEST = 10**6  # of a count in a plan, and of a budget: more is a damaged or hostile card, or a slip
+MAX_COUNT = 10**6  # of a count in a plan, and of a budget: more comes from a damaged or hostile card
 
 
 @entry_point("evaluate")
 def main(cfg: DictConfig) -> None:
-    """Evaluates; stopped by a signal, it says that the same command starts over."""
+    """Evaluates. After a signal the same command starts over."""
     with exit_on_signal(signal.SIGTERM, signal.SIGINT, resumes=False):
         evaluate(cfg)
 
@@ -50,11 +42,6 @@ def evaluate(cfg: DictConfig) -> None:
     """Loads, plans on the frozen pairs, prints, writes."""
     if OmegaConf.is_missing(cfg, "checkpoint"):
         raise ValueError("name the model to evaluate: checkpoint=runs/two_room_cpu_ficreg_seed0, say.")
-    if cfg.budget is not None and cfg.budget < 1 or cfg.num_envs < 1 or min(cfg.record, cfg.num_workers) < 0:
-        raise ValueError(
-            "budget and num_envs must be positive, record and num_workers not negative, got "
-            f"{cfg.budget}, {cfg.num_envs}, {cfg.record} and {cfg.num_workers}."
-        )
     checkpoint = find_checkpoint(cfg.checkpoint)
     run_dir = checkpoint.parent.parent
     manifest = Path(cfg.pairs or run_dir / "pairs.json")
@@ -71,8 +58,7 @@ def evaluate(cfg: DictConfig) -> None:
     plan_config(plan)
     check_horizon(plan, model.frame_skip, budget)
     device = get_device(cfg.device)
-    bounds = (card.action_low, card.action_high)
-    policy = make_policy(plan, model.to(device), inverse_model.to(device), bounds, run_dir)
+    policy = make_policy(plan, model.to(device), inverse_model.to(device), card, run_dir)
     settings = {
         "checkpoint": checkpoint.name,
         "weights": checksum_of(model.state_dict())[:8],
@@ -85,7 +71,7 @@ def evaluate(cfg: DictConfig) -> None:
     folder = claim_folder(parent / folder_name(settings), None if cfg.output else parent)
     if (folder / RESULTS).exists():
         print(f"{folder} holds this very evaluation: it is repeated and written anew")
-    outcome, floor = evaluate_beside_random(
+    outcome, random_baseline = evaluate_with_random_baseline(
         policy,
         pairs,
         card,
@@ -94,8 +80,9 @@ def evaluate(cfg: DictConfig) -> None:
         num_workers=cfg.num_workers,
         record=cfg.record,
     )
-    results = {**result_rows(str(trained.method.get("name")), plan, outcome, floor), **settings, "versions": versions()}
-    # Before anything is written: a full disk shall not cost the numbers.
+    rows = result_rows(str(trained.method.get("name")), plan, outcome, random_baseline)
+    results = {**rows, **settings, "versions": versions()}
+    # Printed before anything is written, so that a full disk does not cost the numbers.
     show({folder.name: results, **read_others(parent, folder.name)})
     resolved = {**OmegaConf.to_container(cfg), "budget": budget, "plan": settings["plan"]}
     write_atomic(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(resolved)))
@@ -106,7 +93,7 @@ def evaluate(cfg: DictConfig) -> None:
 
 
 def plan_of_run(cfg: DictConfig, trained: DictConfig) -> DictConfig:
-    """The plan settings of the training run, with what was typed on the command line instead."""
+    """The plan of the training run, with the fields of the command line replaced."""
     typed = [override.split("=")[0] for override in HydraConfig.get().overrides.task]
     if "plan" in typed:
         check_consistency(cfg.plan, trained)
@@ -120,7 +107,7 @@ def plan_of_run(cfg: DictConfig, trained: DictConfig) -> DictConfig:
 
 
 def check_sizes(plan: DictConfig, budget: Any) -> None:
-    """Refuses counts with which no evaluation would ever end.
+    """Refuses counts with which an evaluation would never end.
 
     Raises:
         ValueError: one is too large, or the budget is no positive whole number.
@@ -128,19 +115,19 @@ def check_sizes(plan: DictConfig, budget: Any) -> None:
     if isinstance(budget, bool) or not isinstance(budget, int) or budget < 1:
         raise ValueError(f"budget={budget!r} of the training run is no positive whole number: give budget=50, say.")
     counts = {f"plan.{key}": value for key, value in plan.items() if key not in ("seed", "compile")} | {"budget": budget}
-    large = [f"{key}={value}" for key, value in counts.items() if isinstance(value, (int, float)) and value > LARGEST]
+    large = [f"{key}={value}" for key, value in counts.items() if isinstance(value, (int, float)) and value > MAX_COUNT]
     if large:
-        raise ValueError(f"{', '.join(large)}: expected at most {LARGEST}; give smaller ones on the command line.")
+        raise ValueError(f"{', '.join(large)}: expected at most {MAX_COUNT}; give smaller ones on the command line.")
 
 
 def folder_name(settings: dict[str, Any]) -> str:
-    """The search and a hash of all that an outcome depends on."""
+    """The search and a hash of everything the outcome depends on."""
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
     return f"{settings['plan']['search']}_{digest[:8]}"
 
 
 def read_others(parent: Path, own: str) -> dict[str, dict[str, Any]]:
-    """The results of the other evaluations below a folder, by the names of their folders; says which are damaged."""
+    """The results of the other evaluations in a folder, by the names of their folders; names the damaged ones."""
     found = {}
     for path in sorted(parent.glob(f"*/{RESULTS}")):
         if path.parent.name == own:
@@ -166,9 +153,9 @@ def check_results(results: Any) -> dict[str, Any]:
     for number in (*numbers, low, high, 0 if unsolved is None else unsolved):
         if isinstance(number, bool) or not isinstance(number, (int, float)) or not math.isfinite(number):
             raise ValueError(f"{str(number)[:40]!r} is no number")
-    shared = {key: results[key] for key in SHARED if key != "weights"}  # which older ones lack
+    shared = {key: results[key] for key in SHARED if key != "weights"}  # older results have none
     for key, value in {**shared, **flatten({**results["plan"]})}.items():
-        if not f"{key}{str(value)[:24]}".isprintable():  # it could move the cursor of a terminal
+        if not f"{key}{str(value)[:24]}".isprintable():  # it could contain control sequences of a terminal
             raise ValueError(f"{key[:40]!r}={str(value)[:24]!r} is no setting")
     if not row_name(results).isprintable() or len(row_name(results)) > 80:
         raise ValueError("method and search are no names")
@@ -176,7 +163,7 @@ def check_results(results: Any) -> dict[str, Any]:
 
 
 def row_name(results: dict[str, Any]) -> str:
-    """How the table calls an evaluation: by method and search."""
+    """The name of an evaluation in the table: its method and search."""
     return f"{results['method']}, {results['search']}"
 
 

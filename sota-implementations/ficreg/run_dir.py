@@ -1,67 +1,77 @@
-"""The folder of a run: it belongs to one configuration, and to one process at a time."""
+"""Folders and files of the scripts: the run directory of one configuration and one process, output folders, JSON."""
 
 from __future__ import annotations
 
+import importlib.metadata
+import json
+import math
 import os
+import platform
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, ExitStack
 from pathlib import Path
 from typing import Any
 
+import tensordict
+import torch
+import torchrl
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from utils import flatten
 
-from torchrl_ficreg._utils import lock_folder, MOST_JSON_BYTES, read_bytes, write_atomic
+from torchrl_ficreg._device import describe_processor
+from torchrl_ficreg._utils import lock_folder, MOST_JSON_BYTES, nearest_folder, read_bytes, write_atomic
+from torchrl_ficreg.distributed import is_main
 from torchrl_ficreg.trainers.checkpoint import CHECKPOINTS, checkpoints_in, find_checkpoint, read_card
 from torchrl_ficreg.trainers.offline import METRICS
 
 README = "README.txt"
-_README = """{name}: a run of train.py, begun or continued by
+_README = """{name}: a run of train.py, started or continued by
 
     python train.py {overrides}
 
-The same command continues it after a stop of any kind (SIGTERM or Ctrl-C in training: it writes a checkpoint and exits
-with code 85 or 130), and evaluates it again once it has finished. Without training, with other settings of the
-evaluation:
+The same command continues the run after any interruption (on SIGTERM or Ctrl-C, training writes a checkpoint and exits
+with code 85 or 130), and evaluates it again once it has finished. To evaluate with other settings, without training:
 
     python evaluate.py checkpoint={run_dir}
 
-checkpoints/          the latest two, and the best where evaluation.every was set: weights, optimiser, schedule, random
-                      state, position in the data, action statistics and configuration; torchrl.checkpoint opens them,
-                      torchrl_ficreg.trainers.load_world_model makes a model of them; epoch-* is the one that
-                      results.json is about, where evaluation.epoch was set
-config.yaml           every setting, resolved; from_run_dir: where the data lie, seen from here
-metrics.csv           losses, gradient norms, health of the latents, speed and memory; a row every few steps, and one of
-                      held-out clips after every epoch
+checkpoints/          the latest two, and the best one if evaluation.every is set: weights, optimizer, schedule, random
+                      state, position in the data, action statistics and configuration. torchrl.checkpoint opens them;
+                      torchrl_ficreg.trainers.load_world_model returns the model. epoch-* is the one evaluated in
+                      results.json, if evaluation.epoch is set
+config.yaml           all settings, resolved; from_run_dir: paths of the data relative to this folder
+metrics.csv           losses, gradient norms, collapse diagnostics, throughput and memory every few steps; losses of
+                      validation clips after every epoch
 pairs.json            starts and goals of the evaluation; pairs_*.json of the further tests of evaluation.also
-results.json          success rates with their intervals, what training took, versions of the packages
+results.json          success rates with confidence intervals, training time, versions of the packages
 episodes.gif          rollouts of the planner
 learning_curve.png    losses against steps
 latent_distance.png   distance in latent space against true distance
-evaluation/           what evaluate.py found, a folder <search>_<hash of its settings> each: results.json, config.yaml and
+evaluation/           results of evaluate.py, in folders <search>_<hash of its settings>: results.json, config.yaml and
                       episodes.gif
-goal_policy/          what train_policy.py made
-wandb/, tensorboard/  files of the logger, where one was asked for
+goal_policy/          the policy of train_policy.py
+wandb/, tensorboard/  files of the logger, if one is set
 """
 
-# Settings that change neither the weights nor how they are reached; a finished run may be given others.
-_FREE = ("collect.", "distributed.", "device", "evaluation.", "plan.", "logger.", "resume")
-_FREE += ("optim.checkpoint_activations",)  # which changes no number; a compiled graph draws other dropout masks
-_FREE += ("env.budget", "env.goal_offset", "env.num_workers", "env.state_unit")
-_PLACES = ("data_dir", "dataset")
-_DAMAGE = (ValueError, TypeError, AttributeError, AssertionError, RecursionError)  # what a damaged config.yaml leads to
-_FROM_RUN_DIR = "from_run_dir"  # of config.yaml; the other settings are those of the command line
+# Settings that do not influence the weights: a run may be continued with other values.
+_NOT_IN_FINGERPRINT = ("collect.", "distributed.", "device", "evaluation.", "plan.", "logger.", "resume")
+_NOT_IN_FINGERPRINT += ("optim.checkpoint_activations",)  # not optim.compile: a compiled graph draws other dropout masks
+_NOT_IN_FINGERPRINT += ("env.budget", "env.goal_offset", "env.num_workers", "env.state_unit")
+_PATHS = ("data_dir", "dataset")
+_DAMAGE = (ValueError, TypeError, AttributeError, AssertionError, RecursionError)  # errors of a damaged config.yaml
+_FROM_RUN_DIR = "from_run_dir"  # entry of config.yaml: _PATHS relative to the run directory
 
 
 def check_run_dir(cfg: DictConfig) -> Path:
-    """The run's folder, which belongs to one configuration as soon as that one has trained. Writes nothing.
+    """The run directory. As soon as a configuration has trained in it, it refuses any other. Writes nothing.
 
     Raises:
         ValueError: it holds a run of another configuration, or any run under ``resume=never``.
     """
     run_dir, ours = Path(cfg.runs_dir) / cfg.name, OmegaConf.to_container(cfg, resolve=True)
-    for name in (CHECKPOINTS, "wandb", "tensorboard"):  # a folder from elsewhere may have come with its links
+    for name in (CHECKPOINTS, "wandb", "tensorboard"):  # a copied folder may contain links
         if (run_dir / name).is_symlink():
             raise ValueError(f"{run_dir / name} is a link, through which nothing is written: remove it, or give another name=...")
     path = run_dir / "config.yaml"
@@ -69,23 +79,24 @@ def check_run_dir(cfg: DictConfig) -> Path:
         theirs = _read_config(path)
         if cfg.resume == "never":
             raise ValueError(f"{run_dir} holds a run and resume=never: give another name=..., or resume=auto.")
-        theirs["runs_dir"], places = ours["runs_dir"], theirs.pop(_FROM_RUN_DIR, None)  # it is the folder that was read
-        _same_places(ours, theirs, _from_run_dir(ours, run_dir), places if isinstance(places, dict) else {})
+        theirs["runs_dir"] = ours["runs_dir"]  # the folder that was just read
+        recorded = theirs.pop(_FROM_RUN_DIR, None)
+        _unify_paths(ours, theirs, _from_run_dir(ours, run_dir), recorded if isinstance(recorded, dict) else {})
         if what := _differences(ours, theirs):
             raise ValueError(f"{run_dir} holds a run of another configuration ({what}): give another name=...")
     return run_dir
 
 
 def _read_config(path: Path) -> dict[str, Any]:
-    """The settings that a run noted.
+    """The settings in a run's config.yaml.
 
     Raises:
-        ValueError: they cannot be read.
+        ValueError: the file is damaged.
     """
     try:
         text = read_bytes(path, most=MOST_JSON_BYTES).decode()
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
-            raise ValueError("it has aliases, of which a few lines can stand for gigabytes")
+            raise ValueError("it has aliases, which can expand to gigabytes")
         config = OmegaConf.to_container(OmegaConf.create(text))
         if not isinstance(config, dict) or "model" not in config:
             raise ValueError("it has no settings of a model")
@@ -96,45 +107,44 @@ def _read_config(path: Path) -> dict[str, Any]:
 
 
 def _from_run_dir(config: dict[str, Any], run_dir: Path) -> dict[str, str]:
-    """The way to each place from the run's folder, which stays the same wherever a command is given."""
-    places = {key: config[key] for key in _PLACES if config[key] is not None}
-    return {key: _way(Path(place).resolve(), run_dir.resolve()) for key, place in places.items()}
-
-
-def _way(place: Path, start: Path) -> str:
+    """The paths of the data relative to the run directory, which do not depend on the working directory."""
+    paths = {key: Path(config[key]).resolve() for key in _PATHS if config[key] is not None}
     try:
-        return os.path.relpath(place, start)
-    except ValueError:  # two drives of Windows
-        return str(place)
+        return {key: os.path.relpath(path, run_dir.resolve()) for key, path in paths.items()}
+    except ValueError:  # another drive of Windows
+        return {key: str(path) for key, path in paths.items()}
 
 
-def _same_places(
-    ours: dict[str, Any], theirs: dict[str, Any], our_ways: dict[str, str] | None = None, ways: dict[str, Any] | None = None
+def _unify_paths(
+    ours: dict[str, Any],
+    theirs: dict[str, Any],
+    our_relative: dict[str, str] | None = None,
+    their_relative: dict[str, Any] | None = None,
 ) -> None:
-    """Writes their places as ours are where both are one: seen from the run's folder, or from the working folder."""
-    for key in _PLACES:
+    """Replaces their paths by ours where both are the same place, relative to the run or to the working directory."""
+    for key in _PATHS:
         mine, other = ours.get(key), theirs.get(key)
         if mine is None or not isinstance(other, str):
             continue
-        way = (our_ways or {}).get(key)
-        if way is not None and way == (ways or {}).get(key) or Path(mine).resolve() == Path(other).resolve():
+        relative = (our_relative or {}).get(key)
+        if relative is not None and relative == (their_relative or {}).get(key) or Path(mine).resolve() == Path(other).resolve():
             theirs[key] = mine
 
 
 def _differences(ours: dict[str, Any], theirs: dict[str, Any], free: tuple[str, ...] = ()) -> str:
-    """The first settings that differ, in words; empty where none of weight does."""
+    """The first three settings that differ, as text; empty if only settings outside the fingerprint do."""
     ours, theirs = flatten(ours), flatten(theirs)
-    keys = [key for key in sorted(ours | theirs) if not key.startswith((*_FREE, *free))]
+    keys = [key for key in sorted(ours | theirs) if not key.startswith((*_NOT_IN_FINGERPRINT, *free))]
     differ = [key for key in keys if ours.get(key) != theirs.get(key)]
     return ", ".join(f"{key}: {str(theirs.get(key))[:60]} -> {str(ours.get(key))[:60]}" for key in differ[:3])
 
 
 def find_start(cfg: DictConfig, run_dir: Path) -> Path | None:
-    """The checkpoint that ``resume=<path>`` names, from which a run without any of its own begins; else None.
+    """The checkpoint of ``resume=<path>``, if the run has none of its own yet; else None.
 
     Raises:
-        FileNotFoundError: there is none.
-        ValueError: it is an earlier one of this very run, or was made with other settings.
+        FileNotFoundError: there is no such checkpoint.
+        ValueError: it is an earlier checkpoint of the same run, or was made with other settings.
     """
     if cfg.resume in ("auto", "never"):
         return None
@@ -146,29 +156,120 @@ def find_start(cfg: DictConfig, run_dir: Path) -> Path | None:
             raise ValueError(f"{own} holds later checkpoints than {start.name}: move those away, and resume=auto takes it.")
         return None
     ours, theirs = OmegaConf.to_container(cfg, resolve=True), dict(read_card(start).config)
-    _same_places(ours, theirs)
+    _unify_paths(ours, theirs)
     what = _differences(ours, theirs, free=("name", "data_dir", "runs_dir"))
     if what:
         raise ValueError(f"{start} was made with other settings ({what}): repeat them.")
     return start
 
 
-def claim_run_dir(cfg: DictConfig) -> Path:
-    """Makes the run's folder, takes it for this process and notes the configuration in it.
+@contextmanager
+def claim_run_dir(cfg: DictConfig) -> Iterator[Path]:
+    """Creates the run directory, writes the configuration into it and locks it. Only rank 0 does; others pass through.
 
     Raises:
         ValueError: it holds a run of another configuration.
-        RuntimeError: another process is at work in it.
+        RuntimeError: another process works in it.
     """
+    if not is_main():
+        yield Path(cfg.runs_dir) / cfg.name
+        return
     run_dir = check_run_dir(cfg)
     run_dir.mkdir(parents=True, exist_ok=True)
-    try:  # held, on the folder itself, until this process ends
-        lock_folder(run_dir)
-    except BlockingIOError as error:
-        raise RuntimeError(f"another process is at work in {run_dir}: wait for it, or give another name=...") from error
-    settings = OmegaConf.to_container(cfg, resolve=True)
-    settings[_FROM_RUN_DIR] = _from_run_dir(settings, run_dir)
-    write_atomic(run_dir / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(settings)))
-    overrides = " ".join(HydraConfig.get().overrides.task) if HydraConfig.initialized() else f"name={cfg.name} ..."
-    write_atomic(run_dir / README, _README.format(name=cfg.name, overrides=overrides, run_dir=f"{cfg.runs_dir}/{cfg.name}"))
-    return run_dir
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(lock_folder(run_dir))
+        except BlockingIOError as error:
+            raise RuntimeError(f"another process is at work in {run_dir}: wait for it, or give another name=...") from error
+        settings = OmegaConf.to_container(cfg, resolve=True)
+        settings[_FROM_RUN_DIR] = _from_run_dir(settings, run_dir)
+        write_atomic(run_dir / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(settings)))
+        overrides = " ".join(HydraConfig.get().overrides.task) if HydraConfig.initialized() else f"name={cfg.name} ..."
+        text = _README.format(name=cfg.name, overrides=overrides, run_dir=f"{cfg.runs_dir}/{cfg.name}")
+        write_atomic(run_dir / README, text)
+        yield run_dir
+
+
+def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as one level of dotted names."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+def is_writable(path: Path) -> bool:
+    """Whether files can be created in a folder, or in its nearest existing parent."""
+    place = nearest_folder(path)
+    return place.is_dir() and os.access(place, os.W_OK | os.X_OK)
+
+
+def check_writable(path: Path, setting: str) -> None:
+    """Checks, before any work, that results can be written.
+
+    Args:
+        path: the folder they go to, which need not exist yet.
+        setting: the setting that names it.
+
+    Raises:
+        OSError: they cannot.
+    """
+    if not is_writable(path):
+        raise OSError(f"{path} cannot be written (read-only, not yours, or below a file): give another {setting}=...")
+
+
+def claim_folder(folder: Path, parent: Path | None = None) -> Path:
+    """Creates a folder and checks that files can be written there, before the work whose results go into it.
+
+    Args:
+        folder: the folder.
+        parent: a further folder that must not be a link, because its owner may be someone else.
+
+    Raises:
+        OSError: nothing can be written there, or it is a link.
+    """
+    for place in (parent, folder):
+        if place is not None and place.is_symlink():
+            raise OSError(f"{place} is a link, through which nothing is written: remove it, or give output=<folder>.")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(b"0")
+    except OSError as error:
+        raise OSError(f"cannot write in {folder} ({error.strerror}): give output=<a folder that can be written>.") from error
+    return folder
+
+
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Writes strict JSON atomically; NaN and infinity become null."""
+    write_atomic(path, json.dumps(_finite(values), indent=2, allow_nan=False) + "\n")
+
+
+def _finite(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {key: _finite(value) for key, value in tree.items()}
+    if isinstance(tree, (list, tuple)):
+        return [_finite(value) for value in tree]
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
+
+
+def versions() -> dict[str, str]:
+    """Versions and hardware that a result depends on."""
+
+    def version(package: str) -> str:
+        try:
+            return importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:  # found on the path
+            return "not installed"
+
+    return {
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "torchrl": torchrl.__version__,
+        "tensordict": tensordict.__version__,
+        "torchrl_ficreg": version("torchrl_ficreg"),
+        "numpy": version("numpy"),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads",
+        "processor": describe_processor(),
+    }

@@ -2,7 +2,8 @@
 
     python train_policy.py checkpoint=runs/two_room_cpu_ficreg_seed0
 
-It goes beside the run's checkpoints, acts without planning, and proposes plans to a search.
+The policy is saved in the run directory. It acts without planning (plan=policy), or proposes candidates to a search
+(plan.policy=auto).
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from cli import entry_point
-from episodes import dataset_path, find_dataset, make_dataset
 from omegaconf import DictConfig, OmegaConf
+from run_dir import claim_folder, flatten, versions, write_json
 from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 from tqdm import trange
-from utils import claim_folder, encoder_of, flatten, get_device, settings_of_card, versions, write_json
+from utils import dataset_path, encoder_of, get_device, make_dataset, open_dataset, settings_of_card
 
 from torchrl_ficreg import LatentWorldModel
-from torchrl_ficreg._device import autocast, check_precision
+from torchrl_ficreg._device import autocast
 from torchrl_ficreg._safe_files import require_safetensors
 from torchrl_ficreg._utils import read_json
 from torchrl_ficreg.data.latents import BLOCKS, encode_episodes, GoalRows
@@ -33,20 +34,23 @@ from torchrl_ficreg.pretrained import ModelCard
 from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_model, WarmupCosine
 
 METRICS = "metrics.json"
-# Where things are and how fast they go: settings that make no other policy.
-_FREE = ("checkpoint", "dataset", "output", "overwrite", "device", "frames_per_batch")
+# Settings that do not influence the weights of the policy.
+_NOT_IN_FINGERPRINT = ("checkpoint", "dataset", "output", "overwrite", "device", "frames_per_batch")
 
 
 @entry_point("train_policy")
 def main(cfg: DictConfig) -> None:
-    """Trains a policy, or shows the numbers of the one there is."""
-    check_settings(cfg)
+    """Trains a policy, or shows the numbers of the existing one. After a signal the same command starts over."""
+    if OmegaConf.is_missing(cfg, "checkpoint"):
+        raise ValueError("name the model to train a policy for: checkpoint=runs/two_room_cpu_ficreg_seed0, say.")
+    get_device(cfg.device)
+    require_safetensors()
     with exit_on_signal(signal.SIGTERM, signal.SIGINT, resumes=False):
-        train_beside(cfg)
+        train_for_run(cfg)
 
 
-def train_beside(cfg: DictConfig) -> None:
-    """Loads, encodes once, trains, measures, writes."""
+def train_for_run(cfg: DictConfig) -> None:
+    """Trains the policy of a run in its folder; a folder that stays empty is removed."""
     checkpoint = find_checkpoint(cfg.checkpoint)
     folder = Path(cfg.output or checkpoint.parent.parent / "goal_policy")
     model, _, card = load_world_model(checkpoint)
@@ -66,7 +70,7 @@ def train_beside(cfg: DictConfig) -> None:
 
 
 def train_into(cfg: DictConfig, folder: Path, checkpoint: Path, model: LatentWorldModel, card: ModelCard) -> None:
-    """Trains, prints the numbers and writes policy and numbers; a policy already there stays until then."""
+    """Encodes all frames once, trains, prints and writes; an existing policy is replaced at the end."""
     began = time.perf_counter()
     device = get_device(cfg.device)
     train_rows, held_out = make_rows(cfg, model.to(device), card)
@@ -81,35 +85,35 @@ def train_into(cfg: DictConfig, folder: Path, checkpoint: Path, model: LatentWor
         "config": OmegaConf.to_container(cfg),
         "versions": versions(),
     }
-    report(metrics)  # before anything is written: a full disk shall not cost the numbers
+    report(metrics)  # before anything is written, so that a full disk does not cost the numbers
     save_goal_policy(policy, folder, model)
-    (folder / METRICS).unlink(missing_ok=True)  # written last, it says that the folder is whole
+    (folder / METRICS).unlink(missing_ok=True)  # written last: marks the folder as complete
     write_json(folder / METRICS, metrics)
     print(f"policy and {METRICS} in {folder}")
 
 
 def make_rows(cfg: DictConfig, model: LatentWorldModel, card: ModelCard) -> tuple[GoalRows, GoalRows]:
-    """Rows of the training episodes and of the validation episodes, every frame encoded once."""
+    """Rows of the training and of the validation episodes; every frame is encoded once."""
     run = settings_of_card(card)
-    # Named explicitly, a dataset that has gone is missed rather than recorded anew.
+    # A missing dataset that is named explicitly is an error; otherwise it would be recorded again.
     run.dataset = cfg.dataset or run.dataset or str(dataset_path(run))
-    path, encode, rows = find_dataset(run), encoder_of(model, cfg.optim.precision), []
+    store, encode, rows = open_dataset(run), encoder_of(model, cfg.optim.precision), []
     for split in ("train", "validation"):
-        dataset = make_dataset(run, path, split, num_frames=2, batch_size=None, statistics=model.statistics)
+        dataset = make_dataset(run, store, split, num_frames=2, batch_size=None, statistics=model.statistics)
         latent = encode_episodes(dataset, encode, batch_size=cfg.frames_per_batch, description=f"encode {split}")
         rows.append(GoalRows(dataset, latent, max_blocks=cfg.max_blocks))
     return rows[0], rows[1]
 
 
 def train(cfg: DictConfig, model: LatentWorldModel, rows: GoalRows) -> GoalPolicy:
-    """The policy, in eval mode."""
+    """Trains by behaviour cloning (squared error) and returns the policy, in eval mode."""
     torch.manual_seed(cfg.seed)
     generator = torch.Generator().manual_seed(cfg.seed)
     network, device = model.predictor.module, rows.latent.device
     policy = GoalPolicy(network.latent_dim, network.action_dim, **cfg.policy)
-    policy.standardize_by(rows.latent.cpu())  # in float64, which MPS has not
+    policy.standardize_by(rows.latent.cpu())  # in float64, which MPS does not have
     policy.to(device)
-    with warnings.catch_warnings():  # of TorchRL's, about target parameters that BCLoss has none of
+    with warnings.catch_warnings():  # TorchRL warns about target parameters, of which BCLoss has none
         warnings.filterwarnings("ignore", message="The name target_actor_network_params")
         loss_module = BCLoss(policy, loss_function="l2")
     optim = cfg.optim
@@ -125,38 +129,38 @@ def train(cfg: DictConfig, model: LatentWorldModel, rows: GoalRows) -> GoalPolic
             optimizer.step()
             optimizer.zero_grad()
             schedule.step()
-            if step % 50 == 0:  # seldom: on a GPU every look at the loss waits for it
+            if step % 50 == 0:  # rarely: reading the loss synchronises with the GPU
                 bar.set_postfix_str(f"loss {loss.item():.3f}", refresh=False)
     return policy.eval()
 
 
 @torch.no_grad()
 def measure(policy: GoalPolicy, rows: TensorDict) -> dict:
-    """How well the actions of some rows are recovered: mean squared error and R^2, z-scored, also by distance of goal.
+    """Mean squared error and R^2 of the actions of some rows, z-scored, also by distance of the goal.
 
-    R^2 is 1 - squared error / variance about the mean, summed over all numbers of a block.
+    R^2 is 1 - squared error / variance about the mean, summed over the components of a block.
     """
     action = rows[ACTION]
-    answer = torch.cat([policy.module(part[LATENT], part[GOAL_LATENT]) for part in rows.split(4096)])
-    # Summed in float64 by NumPy: MPS has none.
-    error = (answer - action).square().sum(-1).cpu().numpy().astype(np.float64)  # [B]
-    spread = (action - action.mean(0)).square().sum(-1).cpu().numpy().astype(np.float64)  # [B]
+    predicted = torch.cat([policy.module(part[LATENT], part[GOAL_LATENT]) for part in rows.split(4096)])
+    # Summed in float64 by NumPy: MPS has no float64.
+    error = (predicted - action).square().sum(-1).cpu().numpy().astype(np.float64)  # [B]
+    deviation = (action - action.mean(0)).square().sum(-1).cpu().numpy().astype(np.float64)  # [B]
     blocks = rows[BLOCKS].cpu().numpy()
     near = {int(k): blocks == k for k in np.unique(blocks)}
     return {
         "loss": float(error.mean() / action.shape[-1]),
-        "r2": _r2(error, spread),
-        "r2_by_blocks": {str(k): _r2(error[here], spread[here]) for k, here in near.items()},
+        "r2": _r2(error, deviation),
+        "r2_by_blocks": {str(k): _r2(error[here], deviation[here]) for k, here in near.items()},
     }
 
 
-def _r2(error: np.ndarray, spread: np.ndarray) -> float | None:
-    total = float(spread.sum())
-    return 1 - float(error.sum()) / total if total > 0 else None  # None where the action never changes
+def _r2(error: np.ndarray, deviation: np.ndarray) -> float | None:
+    total = float(deviation.sum())
+    return 1 - float(error.sum()) / total if total > 0 else None  # None if the action never changes
 
 
 def report(metrics: dict) -> None:
-    """Prints what a reader asks for first."""
+    """Prints R^2, overall and by distance of the goal."""
     shown = {name: metrics[name]["r2"] for name in ("validation", "train")}
     held_out, seen = ("-" if value is None else f"{value:.3f}" for value in shown.values())
     by_blocks = metrics["validation"]["r2_by_blocks"].items()
@@ -165,7 +169,7 @@ def report(metrics: dict) -> None:
 
 
 def read_metrics(cfg: DictConfig, folder: Path, model: LatentWorldModel) -> dict:
-    """The numbers of a policy trained before, which must be the one asked for.
+    """The numbers of an existing policy, which must have the same settings.
 
     Raises:
         ValueError: it was trained with other settings, or for other weights.
@@ -178,39 +182,11 @@ def read_metrics(cfg: DictConfig, folder: Path, model: LatentWorldModel) -> dict
         [float(r2) for r2 in metrics["validation"]["r2_by_blocks"].values() if r2 is not None]
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise ValueError(f"{folder / METRICS} is damaged ({error!r:.80}): overwrite=true trains the policy again.") from error
-    differ = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key) and key not in _FREE]
+    differ = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key) and key not in _NOT_IN_FINGERPRINT]
     if differ:
         what = ", ".join(f"{key}: {theirs.get(key)} -> {ours.get(key)}" for key in differ[:3])
         raise ValueError(f"{folder} holds a policy of other settings ({what}): give overwrite=true, or output=...")
     return metrics
-
-
-def check_settings(cfg: DictConfig) -> None:
-    """Finds mistakes in a configuration before anything is written.
-
-    Raises:
-        ValueError: a setting outside its range.
-        ImportError: the package that saves policies is missing.
-    """
-    if OmegaConf.is_missing(cfg, "checkpoint"):
-        raise ValueError("name the model to train a policy for: checkpoint=runs/two_room_cpu_ficreg_seed0, say.")
-    optim = cfg.optim
-    positive = {"max_blocks": cfg.max_blocks, "validation_rows": cfg.validation_rows}
-    positive |= {"frames_per_batch": cfg.frames_per_batch}
-    positive |= {f"policy.{key}": value for key, value in cfg.policy.items()}
-    positive |= {f"optim.{key}": optim[key] for key in ("steps", "batch_size", "lr", "clip_norm")}
-    wrong = [f"{key}={value}" for key, value in positive.items() if not value > 0]
-    if wrong:
-        raise ValueError(f"must be positive: {', '.join(wrong)}.")
-    natural = {"seed": cfg.seed, "optim.weight_decay": optim.weight_decay}
-    wrong = [f"{key}={value}" for key, value in natural.items() if not 0 <= value < 2**63]
-    if wrong:
-        raise ValueError(f"must not be negative nor exceed 63 bits: {', '.join(wrong)}.")
-    if not 0 <= optim.warmup < 1:
-        raise ValueError(f"optim.warmup must lie in [0, 1), got {optim.warmup}.")
-    check_precision(optim.precision)
-    get_device(cfg.device)
-    require_safetensors()
 
 
 if __name__ == "__main__":

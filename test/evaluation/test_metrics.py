@@ -1,11 +1,13 @@
-"""Intervals and correlations against published or hand-computed values."""
+"""Intervals and correlations against published or hand-computed values, distance profiles of known encoders."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
-from torchrl_ficreg.evaluation import rank_correlation, wilson_interval
+from torchrl_ficreg.data import OfflineTrajectories
+from torchrl_ficreg.evaluation import latent_distance, rank_correlation, wilson_interval
 
 
 @pytest.mark.parametrize(
@@ -60,3 +62,54 @@ def test_equal_values_share_their_rank():
 def test_a_collapsed_latent_space_correlates_with_nothing():
     """All latent distances equal: no order, hence 0, whatever the order of the pairs."""
     assert rank_correlation(np.arange(10), np.zeros(10)) == 0
+
+
+class Positions:
+    """A world model whose latent is the state itself, which the first two pixels spell out."""
+
+    action_mean = torch.zeros(2)
+
+    def __init__(self, scale: float = 1.0) -> None:
+        self.scale = scale
+
+    def encode(self, pixels: torch.Tensor) -> torch.Tensor:
+        """[N, 3, H, W] -> [N, 2]."""
+        return self.scale * pixels[:, 0, 0, :2].float()
+
+
+@pytest.fixture(scope="module")
+def walks() -> OfflineTrajectories:
+    """Ten episodes of whole-number states, written into the pixels."""
+    rng = np.random.default_rng(0)
+    episodes = []
+    for _ in range(10):
+        state = rng.integers(0, 256, (30, 2))
+        pixels = np.zeros((30, 3, 4, 4), np.uint8)
+        pixels[:, 0, 0, :2] = state
+        action = np.pad(rng.normal(size=(29, 2)), ((0, 1), (0, 0))).astype(np.float32)
+        episodes.append({"pixels": pixels, "action": action, "state": state.astype(float)})
+    return OfflineTrajectories.from_episodes(episodes, split="all", num_frames=2, frame_skip=1)
+
+
+def test_a_latent_that_is_the_state_follows_it_perfectly(walks):
+    profile = latent_distance(Positions(scale=0.1), walks, num_frames=100)
+    assert profile.rank_correlation == pytest.approx(1, abs=1e-6)
+    assert len(profile.true) == 100 * 99 / 2
+    assert profile.latent == pytest.approx(0.1 * profile.true, rel=1e-5)
+
+
+def test_a_collapsed_encoder_gives_no_slope(walks):
+    assert latent_distance(Positions(scale=0.0), walks).rank_correlation == 0
+
+
+def test_the_same_frames_are_compared_every_time_and_never_more_than_there_are(walks):
+    first, again = (latent_distance(Positions(), walks, num_frames=50, seed=1) for _ in range(2))
+    assert np.array_equal(first.true, again.true)
+    assert not np.array_equal(first.true, latent_distance(Positions(), walks, num_frames=50, seed=2).true)
+    assert len(latent_distance(Positions(), walks, num_frames=10_000).true) == 300 * 299 / 2
+
+
+def test_bins_hold_equally_many_pairs_and_ordered_quantiles(walks):
+    center, quantiles = latent_distance(Positions(), walks).bins(count=10)
+    assert center.shape == (10,) and quantiles.shape == (10, 3)
+    assert (np.diff(center) > 0).all() and (np.diff(quantiles, axis=1) >= 0).all()

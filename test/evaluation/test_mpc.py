@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 from scenes import make_pairs, same_room_pairs, Walker
+from tensordict import TensorDict
 
-from torchrl_ficreg import LatentCEMPlanner, make_world_model, ModelConfig, MPCPolicy, PlanConfig
-from torchrl_ficreg.envs.two_room import render
+from torchrl_ficreg import CEMConfig, LatentCEMPlanner, make_world_model, ModelConfig, MPCPolicy
+from torchrl_ficreg.envs.two_room import render_pixels
 from torchrl_ficreg.envs.two_room.env import TwoRoomEnv
 from torchrl_ficreg.evaluation import evaluate_mpc, save_episodes_gif, UniformPolicy
 
@@ -39,7 +40,7 @@ def planner():
         predictor_dim_head=8,
     )
     model, _ = make_world_model(sizes, action_dim=2)
-    config = PlanConfig(num_candidates=16, num_elites=4, iterations=2, horizon=2, receding_horizon=1)
+    config = CEMConfig(num_candidates=16, num_elites=4, iterations=2, horizon=2, receding_horizon=1)
     return MPCPolicy(LatentCEMPlanner(model.eval(), config, action_bounds=BOX))
 
 
@@ -98,9 +99,7 @@ def test_the_global_random_state_takes_no_part(planner):
         assert all(np.array_equal(a, b) for a, b in zip(first.frames, second.frames))
 
 
-def test_the_random_floor_is_uniform_between_the_bounds_and_seeded():
-    from tensordict import TensorDict
-
+def test_the_random_baseline_is_uniform_between_the_bounds_and_seeded():
     policy = UniformPolicy([-1.0, 2.0], [1.0, 6.0], seed=3)
     td = TensorDict({"plan_seed": torch.arange(50)}, [50])
     actions = torch.cat([policy(td)["action"].clone() for _ in range(40)])  # [2000, 2]
@@ -159,8 +158,8 @@ def test_recorded_frames_are_the_rendered_states():
     assert len(outcome.recorded) == len(outcome.frames) == len(outcome.goals) == 3
     for row, frames, shown_goal in zip(outcome.recorded, outcome.frames, outcome.goals):
         assert frames.shape == (41, 3, 16, 16) and frames.dtype == np.uint8
-        assert np.array_equal(frames[0], render(torch.from_numpy(pairs.start_state[row]), size=16).numpy())
-        goal = render(torch.from_numpy(pairs.goal_state[row]), size=16).numpy()
+        assert np.array_equal(frames[0], render_pixels(torch.from_numpy(pairs.start_state[row]), size=16).numpy())
+        goal = render_pixels(torch.from_numpy(pairs.goal_state[row]), size=16).numpy()
         assert np.array_equal(shown_goal, goal)
         assert np.abs(frames[-1].astype(int) - goal).max() <= 1
 

@@ -1,17 +1,26 @@
-"""Runs the scripts as a user does: in a process of their own, in an empty folder, with overrides that make them tiny."""
+"""Runs the scripts in a folder, with overrides that make them tiny: in this process, or in one of their own."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import io
 import os
 import shutil
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
+import hydra
 import pytest
+import torch
+from omegaconf import DictConfig
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "sota-implementations" / "ficreg"
+sys.path.insert(0, str(SCRIPTS))
 PLAN = ["plan.iterations=1", "plan.num_candidates=20", "plan.num_elites=5"]
 TINY = [
     "env.data.episodes=20",
@@ -30,12 +39,16 @@ TINY = [
 ]
 
 
+def with_tiny(script: str, overrides: tuple[str, ...], tiny: bool) -> list[str]:
+    return [*(TINY if script in ("train.py", "collect.py") and tiny else []), *overrides]
+
+
 @pytest.fixture(scope="session")
 def command() -> Callable[..., list[str]]:
     """``command("train.py", "seed=1")`` is the command line of a tiny run; others get no overrides."""
 
     def build(script: str, *overrides: str, tiny: bool = True) -> list[str]:
-        return [sys.executable, str(SCRIPTS / script), *(TINY if script != "evaluate.py" and tiny else []), *overrides]
+        return [sys.executable, str(SCRIPTS / script), *with_tiny(script, overrides, tiny)]
 
     return build
 
@@ -48,14 +61,65 @@ def environment() -> dict[str, str]:
 
 
 @pytest.fixture(scope="session")
-def execute(command, environment) -> Callable[..., subprocess.CompletedProcess]:
-    """``execute(folder, "train.py", "seed=1")`` runs it there; an exit code other than zero is the test's business."""
+def spawn(command, environment) -> Callable[..., subprocess.CompletedProcess]:
+    """``spawn(folder, "train.py", "seed=1")`` runs it there in a process of its own, as a user does."""
 
     def run(folder: Path, script: str, *overrides: str, tiny: bool = True) -> subprocess.CompletedProcess:
         line = command(script, *overrides, tiny=tiny)
-        return subprocess.run(line, cwd=folder, env=environment, capture_output=True, text=True, timeout=240)
+        return subprocess.run(line, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def execute() -> Callable[..., subprocess.CompletedProcess]:
+    """``execute(folder, "train.py", "seed=1")`` runs it there in this process, which need not import torch again."""
+
+    def run(folder: Path, script: str, *overrides: str, tiny: bool = True) -> subprocess.CompletedProcess:
+        line, here, threads = [script, *with_tiny(script, overrides, tiny)], Path.cwd(), torch.get_num_threads()
+        out, err = io.StringIO(), io.StringIO()
+        main = importlib.import_module(script.removesuffix(".py")).main
+        os.chdir(folder)
+        torch.set_num_threads(1)
+        try:
+            with mock.patch.object(sys, "argv", line), mock.patch.dict(os.environ), warnings.catch_warnings():
+                with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+                    main()
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        finally:
+            os.chdir(here)
+            torch.set_num_threads(threads)
+        return subprocess.CompletedProcess(line, code, out.getvalue(), err.getvalue())
+
+    return run
+
+
+@pytest.fixture
+def refused(execute, tmp_path) -> Callable[..., str]:
+    """``refused("train.py", "seed=-1")`` is the one line in which a script ends; it runs as the user typed it."""
+
+    def run(script: str, *overrides: str, folder: Path = tmp_path, code: int | None = None) -> str:
+        done = execute(folder, script, *overrides, tiny=False)
+        (line,) = done.stderr.splitlines()
+        assert line.startswith("error: ") and done.returncode in ((1, 2) if code is None else (code,)), done
+        assert not done.stdout
+        return line
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def config() -> Callable[..., DictConfig]:
+    """``config("train", "seed=1")`` is a composed configuration."""
+    importlib.import_module("configs")  # the schemas
+
+    def compose(name: str, *overrides: str, **settings: bool) -> DictConfig:
+        with hydra.initialize_config_dir(str(SCRIPTS / "config"), version_base="1.3"):
+            return hydra.compose(name, list(overrides), **settings)
+
+    return compose
 
 
 @pytest.fixture(scope="session")
@@ -67,10 +131,10 @@ def files() -> Callable[[Path], dict[str, bytes]]:
 
 
 @pytest.fixture(scope="session")
-def trained_once(tmp_path_factory, execute, files) -> tuple[Path, set[str]]:
+def trained_once(tmp_path_factory, spawn, files) -> tuple[Path, set[str]]:
     """A folder in which train.py ran once with its defaults made tiny, and what it held right afterwards."""
     folder = tmp_path_factory.mktemp("trained")
-    done = execute(folder, "train.py")
+    done = spawn(folder, "train.py")
     assert done.returncode == 0, done.stderr
     assert "ficreg" in done.stdout and "random" in done.stdout
     return folder, set(files(folder))
@@ -86,3 +150,10 @@ def trained(trained_once) -> Path:
 def copy(trained, tmp_path) -> Path:
     """A copy of it, to be changed."""
     return Path(shutil.copytree(trained, tmp_path / "copy"))
+
+
+@pytest.fixture
+def beside(trained, tmp_path) -> Path:
+    """An empty folder beside the recorded episodes."""
+    (tmp_path / "data").symlink_to(trained / "data")
+    return tmp_path

@@ -3,48 +3,57 @@
 from __future__ import annotations
 
 import json
-import subprocess
+import re
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import MissingConfigException
 from omegaconf import DictConfig
+from utils import model_config
+
+from torchrl_ficreg import ModelConfig
 
 CONFIG = Path(__file__).resolve().parents[2] / "sota-implementations" / "ficreg" / "config"
 ENVIRONMENTS = ("two_room", "push_t", "reacher", "cube")
 
 
-def config(*overrides: str, hydra: bool = False) -> DictConfig:
-    with initialize_config_dir(str(CONFIG), version_base="1.3"):
-        return compose("train", list(overrides), return_hydra_config=hydra)
+@pytest.fixture(scope="module")
+def train(config) -> Callable[..., DictConfig]:
+    """``train("env=push_t")`` is a composed configuration of train.py."""
+    return partial(config, "train")
 
 
-def runs(*overrides: str) -> list[list[str]]:
+@pytest.fixture(scope="module")
+def runs(train) -> Callable[..., list[list[str]]]:
     """The runs that ``python train.py -m`` would start, as Hydra's own sweeper lists them."""
-    params = config(*overrides[:1], hydra=True).hydra.sweeper.params
-    parsed = OverridesParser.create().parse_overrides([*(f"{key}={value}" for key, value in params.items()), *overrides])
-    return BasicSweeper.split_arguments(parsed, None)[0]
+
+    def split(*overrides: str) -> list[list[str]]:
+        params = train(*overrides[:1], return_hydra_config=True).hydra.sweeper.params
+        given = [*(f"{key}={value}" for key, value in params.items()), *overrides]
+        return BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(given), None)[0]
+
+    return split
 
 
 @pytest.mark.parametrize(
     ("experiment", "method"),
     [("ficreg_paper", "ficreg_live"), ("ficreg", "ficreg_detached"), ("lewm_paper", "lewm")],
 )
-def test_an_experiment_is_four_environments_times_three_seeds(experiment, method):
+def test_an_experiment_is_four_environments_times_three_seeds(train, runs, experiment, method):
     found = runs(f"experiment={experiment}")
     assert len(found) == 12
-    names = {config(*overrides).name for overrides in found}
+    names = {train(*overrides).name for overrides in found}
     assert names == {f"{env}_paper_{method}_seed{seed}" for env in ENVIRONMENTS for seed in range(3)}
 
 
 @pytest.mark.parametrize(("experiment", "context"), [("ficreg_paper", "live"), ("ficreg", "detached")])
 @pytest.mark.parametrize("env", ENVIRONMENTS)
-def test_the_published_code_is_run_to_the_letter(experiment, context, env):
+def test_the_published_code_is_run_to_the_letter(train, experiment, context, env):
     """Context of the judgement, length of the schedule, epochs, initialisation and precision of the authors' code."""
-    cfg = config(f"experiment={experiment}", f"env={env}")
+    cfg = train(f"experiment={experiment}", f"env={env}")
     assert (cfg.method.context, cfg.optim.schedule_epochs, cfg.optim.epochs) == (context, 100, 15)
     assert (cfg.evaluation.every, cfg.evaluation.epoch, cfg.plan.precision) == (1, 10, "fp32")
     assert (cfg.model.encoder_init, cfg.model.predictor_position_std) == ("published", 1.0)
@@ -52,29 +61,29 @@ def test_the_published_code_is_run_to_the_letter(experiment, context, env):
 
 
 @pytest.mark.parametrize("other", ["model=paper", "experiment=ficreg"])
-def test_every_setting_in_which_the_published_code_stands_apart_is_in_the_tables(other):
+def test_every_setting_in_which_the_published_code_stands_apart_is_in_the_tables(train, other):
     docs = CONFIG.parents[2] / "docs" / "source"
     tables = "".join((docs / name).read_text() for name in ("scaling.rst", "planning.rst"))
     for env in ENVIRONMENTS:
-        ours, theirs = (config(choice, f"env={env}") for choice in ("experiment=ficreg_paper", other))
+        ours, theirs = (train(choice, f"env={env}") for choice in ("experiment=ficreg_paper", other))
         for group in set(ours) - {"name"}:
             for field in ours[group] if isinstance(ours[group], DictConfig) else ():
                 assert ours[group][field] == theirs[group][field] or f"{group}.{field}" in tables, f"{group}.{field}"
 
 
-def test_the_command_line_narrows_it_down():
+def test_the_command_line_narrows_it_down(runs):
     assert len(runs("experiment=ficreg_paper", "env=push_t", "seed=0,1")) == 2
 
 
-def test_without_m_an_experiment_is_one_run():
-    cfg = config("experiment=lewm_paper", "env=push_t", "seed=2")
+def test_without_m_an_experiment_is_one_run(train):
+    cfg = train("experiment=lewm_paper", "env=push_t", "seed=2")
     assert (cfg.env.name, cfg.model.preset, cfg.method.name, cfg.seed) == ("push_t", "paper", "lewm", 2)
 
 
 @pytest.mark.parametrize("env", ENVIRONMENTS)
-def test_the_papers_recipe_to_the_letter(env):
+def test_the_papers_recipe_to_the_letter(train, env):
     """Numbers of arXiv 2603.19312 and of FICReg's appendix; where code and text differ, those of the code."""
-    cfg = config("model=paper", f"env={env}")
+    cfg = train("model=paper", f"env={env}")
     model, optim, plan = cfg.model, cfg.optim, cfg.plan
     assert (model.encoder, model.image_size, model.latent_dim, model.frame_skip) == ("vit", 224, 192, 5)
     assert model.history == (1 if env == "two_room" else 3)
@@ -90,26 +99,13 @@ def test_the_papers_recipe_to_the_letter(env):
     assert cfg.env.data.episodes == (18685 if env == "push_t" else 10000)
 
 
-def test_an_environments_wishes_hold_against_the_common_file():
-    assert config("env=push_t").refine.steps == 3000
-    assert config("env=push_t", "refine.steps=0").refine.steps == 0
+def test_a_recipe_overrides_the_common_file(train):
+    assert train("env=push_t").refine.steps == 3000
+    assert train("env=push_t", "refine.steps=0").refine.steps == 0
 
 
-def test_the_papers_planning_belongs_to_cem_alone():
-    assert config("model=paper", "env=push_t", "plan=policy").plan.bounds == "environment"
-
-
-@pytest.mark.parametrize(
-    ("launcher", "plugin"), [("slurm", "hydra_submitit_launcher"), ("processes", "hydra_joblib_launcher")]
-)
-def test_launchers_are_known_and_name_what_they_need(launcher, plugin):
-    """With its package a launcher is Hydra's; without it one line says what to install."""
-    try:
-        cfg = config(f"hydra/launcher={launcher}", hydra=True)
-    except MissingConfigException as error:
-        assert {"slurm": "submitit_slurm", "processes": "joblib"}[launcher] in str(error)
-    else:
-        assert plugin in cfg.hydra.launcher._target_
+def test_the_papers_planning_belongs_to_cem_alone(train):
+    assert train("model=paper", "env=push_t", "plan=policy").plan.bounds == "environment"
 
 
 @pytest.mark.parametrize(
@@ -120,12 +116,12 @@ def test_launchers_are_known_and_name_what_they_need(launcher, plugin):
         pytest.param("submitit_local", "hydra_plugins.hydra_submitit_launcher", marks=pytest.mark.slow),
     ],
 )
-def test_a_sweep_over_seeds_makes_a_run_of_each(command, environment, tmp_path, launcher, plugin):
+def test_a_sweep_over_seeds_makes_a_run_of_each(execute, spawn, tmp_path, launcher, plugin):
     """One after another, side by side, and pickled as SLURM's launcher pickles them."""
     pytest.importorskip(plugin)
     small = ("evaluation.num_pairs=2", "evaluation.record=1")
-    line = command("train.py", "seed=0,1", *small, f"hydra/launcher={launcher}", "-m")
-    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    run = execute if launcher == "basic" else spawn
+    done = run(tmp_path, "train.py", "seed=0,1", *small, f"hydra/launcher={launcher}", "-m")
     assert done.returncode == 0, done.stderr
     folders = sorted(path.name for path in (tmp_path / "runs").iterdir() if path.is_dir() and path.name[0] != ".")
     assert folders == ["two_room_cpu_ficreg_seed0", "two_room_cpu_ficreg_seed1"]
@@ -134,11 +130,24 @@ def test_a_sweep_over_seeds_makes_a_run_of_each(command, environment, tmp_path, 
     assert (tmp_path / "runs" / folders[0] / "checkpoints").is_dir()
 
 
-@pytest.mark.slow
-def test_a_run_that_fails_does_not_stop_the_others(command, environment, tmp_path):
+def test_a_run_that_fails_does_not_stop_the_others(execute, beside):
     small = ("evaluation.num_pairs=2", "evaluation.record=1", "name=lr${optim.lr}")
-    line = command("train.py", "optim.lr=-1,5e-4", *small, "-m")
-    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 1 and "(run lr-1" in done.stderr and "Traceback" not in done.stderr
+    done = execute(beside, "train.py", "optim.lr=-1,5e-4", *small, "-m")
+    assert done.returncode == 1 and "optim.lr=-1.0: expected more than 0. (job 0 of the sweep)" in done.stderr and "Traceback" not in done.stderr
     assert done.stderr.strip().splitlines()[-1].startswith("error: not all runs of the sweep succeeded")
-    assert (tmp_path / "runs" / "lr0.0005" / "results.json").is_file()
+    assert (beside / "runs" / "lr0.0005" / "results.json").is_file()
+
+
+@pytest.mark.parametrize("preset", ["cpu", "paper", "gpu_short"])
+def test_a_model_is_the_preset_of_the_package(train, preset):
+    cfg = train(f"model={preset}", "env=reacher")  # whose recipe leaves the model alone
+    assert cfg.model.preset == preset and model_config(cfg) == ModelConfig.preset(preset)
+
+
+def test_every_field_is_commented():
+    """Once: the files that change other files need not repeat it."""
+    for path in (*CONFIG.glob("*.yaml"), *(path for group in ("env", "method", "plan") for path in CONFIG.glob(f"{group}/*.yaml"))):
+        for line in path.read_text().split("\nhydra:")[0].splitlines():
+            field = re.match(r" *([a-z_]+): *[^#\s]", line)
+            if field and field[1] not in ("defaults", "name", "search"):
+                assert "#" in line, f"{path.name}: {line}"

@@ -8,16 +8,15 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
+from omegaconf import OmegaConf
 
-from torchrl_ficreg import LatentCEMPlanner, MPCPolicy, PlanConfig
+from torchrl_ficreg import CEMConfig, LatentCEMPlanner, MPCPolicy
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.envs import collect_episodes
 from torchrl_ficreg.evaluation import evaluate_mpc, StartGoalPairs
 from torchrl_ficreg.trainers import OfflineTrainer
 
 ROOT = Path(__file__).resolve().parents[2]
-CONFIG = ROOT / "sota-implementations" / "ficreg" / "config"
 
 
 @pytest.fixture
@@ -31,13 +30,9 @@ def example() -> dict:
     return names
 
 
-def settings(*path: str) -> dict:
-    return yaml.safe_load(CONFIG.joinpath(*path).read_text())
-
-
-def test_the_example_has_the_weights_of_its_preset(example):
-    """Those of the file that ``make train`` reads; every network got gradient."""
-    weights = settings("model", "cpu.yaml")["loss"]
+def test_the_example_has_the_weights_of_its_preset(example, config):
+    """Those of ``make train``; every network got gradient."""
+    weights = config("train").loss
     for name in ("sigreg_coeff", "idm_coeff", "consistency_coeff"):
         assert float(getattr(example["loss"], name)) == pytest.approx(weights[name])
     for network in (example["model"].encoder, example["model"].predictor, example["inverse_model"]):
@@ -45,10 +40,10 @@ def test_the_example_has_the_weights_of_its_preset(example):
 
 
 @pytest.mark.slow
-def test_the_example_reaches_the_success_rate_of_the_readme(example):
+def test_the_example_reaches_the_success_rate_of_the_readme(example, config):
     """Trained and planned with as ``make train`` does: the 95 % intervals of both success rates overlap."""
-    env, optim = settings("env", "two_room.yaml"), settings("model", "cpu.yaml")["optim"]
-    evaluation, plan = settings("train.yaml")["evaluation"], settings("plan", "cem.yaml")
+    cfg = OmegaConf.to_container(config("train"), resolve=True)
+    env, optim, evaluation, plan = cfg["env"], cfg["optim"], cfg["evaluation"], cfg["plan"]
     model, data = example["model"], env["data"]
     episodes = list(
         collect_episodes(
@@ -69,10 +64,10 @@ def test_the_example_reaches_the_success_rate_of_the_readme(example):
         for split in ("train", "evaluation")
     )
     example["loss"].zero_grad()
-    recipe = {name: float(optim[name]) for name in ("lr", "weight_decay", "warmup", "clip_norm")}  # YAML reads 1e-3 as text
+    recipe = {name: optim[name] for name in ("lr", "weight_decay", "warmup", "clip_norm")}
     OfflineTrainer(example["loss"], clips, epochs=optim["epochs"], progress_bar=False, **recipe).train()
     model.statistics = clips.statistics
-    config = PlanConfig(**{name: plan[name] for name in ("num_candidates", "num_elites", "iterations")})
+    config = CEMConfig(**{name: plan[name] for name in ("num_candidates", "num_elites", "iterations")})
     pairs = StartGoalPairs.draw(held_out, "two_room", evaluation["num_pairs"], env["goal_offset"], evaluation["seed"])
     policy = MPCPolicy(LatentCEMPlanner(model.eval(), config, action_bounds=([-1.0, -1.0], [1.0, 1.0])))
     outcome = evaluate_mpc(

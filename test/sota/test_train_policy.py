@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 import shutil
-import sys
-from pathlib import Path
 
 import pytest
 
 from torchrl_ficreg.modules.goal_policy import load_goal_policy
 from torchrl_ficreg.trainers import load_world_model
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "sota-implementations" / "ficreg"
 RUN = "runs/two_room_cpu_ficreg_seed0"
 SMALL = ["policy.hidden_dim=32", "policy.depth=1", "optim.steps=100", "optim.batch_size=128", "optim.lr=0.01"]
 SMALL += ["validation_rows=500"]
 
 
 @pytest.fixture(scope="module")
-def once(trained, execute, files, tmp_path_factory):
+def once(trained, spawn, files, tmp_path_factory):
     """A copy of the trained run, what it held before, and train_policy.py having run there."""
     folder = shutil.copytree(trained, tmp_path_factory.mktemp("policy") / "copy")
     before = files(folder)
-    return folder, before, execute(folder, "train_policy.py", f"checkpoint={RUN}", *SMALL, tiny=False)
+    return folder, before, spawn(folder, "train_policy.py", f"checkpoint={RUN}", *SMALL, tiny=False)
 
 
 def test_a_policy_appears_beside_the_run_and_nothing_else_changes(once, files):
@@ -54,31 +50,16 @@ def test_the_metrics_say_what_was_measured(once):
     assert str(folder) not in json.dumps(metrics)
 
 
-@pytest.fixture
-def script(monkeypatch):
-    """``script(folder, "optim.steps=3")`` runs it there in this process: a new one each time would be slow."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-
-    def run(folder, *overrides):
-        monkeypatch.chdir(folder)
-        monkeypatch.setattr(sys, "argv", ["train_policy.py", *overrides])
-        importlib.import_module("train_policy").main()
-
-    yield run
-    for name in ("train_policy", "cli", "utils", "episodes"):
-        sys.modules.pop(name, None)
-
-
-def test_the_same_command_again_trains_nothing_unless_told_to(once, script, files, capsys):
+def test_the_same_command_again_trains_nothing_unless_told_to(once, execute, refused, files):
     folder, _, _ = once
     before, line = files(folder), [f"checkpoint={RUN}", *SMALL]
-    script(folder, *line)
-    out, err = capsys.readouterr()
-    assert "holds this policy already: overwrite=true" in out and "R^2 of the actions" in out and "encode" not in err
-    with pytest.raises(SystemExit, match="other settings .optim.steps: 100 -> 3, policy.depth: 1 -> 2.: give over"):
-        script(folder, *line, "optim.steps=3", "policy.depth=2")
+    done = execute(folder, "train_policy.py", *line)
+    assert "holds this policy already: overwrite=true" in done.stdout and "R^2 of the actions" in done.stdout
+    assert "encode" not in done.stderr
+    error = refused("train_policy.py", *line, "optim.steps=3", "policy.depth=2", folder=folder)
+    assert re.search("other settings .optim.steps: 100 -> 3, policy.depth: 1 -> 2.: give over", error)
     assert files(folder) == before
-    script(folder, *line, "optim.steps=3", "overwrite=true")
+    execute(folder, "train_policy.py", *line, "optim.steps=3", "overwrite=true")
     metrics = json.loads((folder / RUN / "goal_policy" / "metrics.json").read_text())
     assert metrics["config"]["optim"]["steps"] == 3
     assert metrics["rows"] == json.loads(before[f"{RUN}/goal_policy/metrics.json"])["rows"]
@@ -87,33 +68,28 @@ def test_the_same_command_again_trains_nothing_unless_told_to(once, script, file
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ([], "name the model to train a policy for: checkpoint=runs/"),
-        ([f"checkpoint={RUN}", "optim.steps=0", "policy.depth=-1"], "must be positive: policy.depth=-1, optim.steps=0"),
-        ([f"checkpoint={RUN}", "optim.warmup=1.0"], r"optim.warmup must lie in \[0, 1\)"),
-        ([f"checkpoint={RUN}", "optim.precision=fp16"], "unknown precision 'fp16'"),
-        ([f"checkpoint={RUN}", "seed=-1"], "must not be negative nor exceed 63 bits: seed=-1"),
+        ([f"checkpoint={RUN}", "optim.steps=0", "policy.depth=-1"], "policy.depth=-1: expected at least 1; optim.steps=0: exp"),
+        ([f"checkpoint={RUN}", "optim.warmup=1.0"], r"optim.warmup=1.0: expected a number in \[0, 1\)"),
+        ([f"checkpoint={RUN}", "optim.precision=fp16"], "optim.precision=fp16: expected one of"),
+        ([f"checkpoint={RUN}", "seed=-1"], "seed=-1: expected 0 to"),
         ([f"checkpoint={RUN}", "max_block=3"], "did you mean 'max_blocks'?"),
         (["checkpoint=runs/nowhere"], "no checkpoint at runs/nowhere"),
-        ([f"checkpoint={RUN}", "dataset=nowhere"], "no dataset at nowhere"),
+        ([f"checkpoint={RUN}", "dataset=nowhere"], "no dataset at .*nowhere"),
     ],
 )
-def test_a_mistake_is_one_line_and_writes_nothing(trained, script, files, overrides, message, capsys):
+def test_a_mistake_is_one_line_and_writes_nothing(trained, refused, files, overrides, message):
     before = files(trained)
-    with pytest.raises(SystemExit) as caught:
-        script(trained, *overrides)
-    assert re.match("error: .*" + message, caught.value.code) and "\n" not in caught.value.code
-    assert not capsys.readouterr().out
+    assert re.search(message, refused("train_policy.py", *overrides, folder=trained))
     assert files(trained) == before
     assert not (trained / RUN / "goal_policy").exists()
 
 
 @pytest.mark.parametrize("content", ["[]", "{", "{}", '{"config": []}', '{"config": {}, "train": 3}'])
-def test_damaged_numbers_of_a_policy_are_one_line(once, script, content):
+def test_damaged_numbers_of_a_policy_are_one_line(once, refused, content):
     folder, _, _ = once
     path = folder / RUN / "goal_policy" / "metrics.json"
     before = path.read_text()
     path.write_text(content)
-    with pytest.raises(SystemExit, match="metrics.json (is damaged|is no readable)") as caught:
-        script(folder, f"checkpoint={RUN}", *SMALL)
-    assert "\n" not in str(caught.value)
+    line = refused("train_policy.py", f"checkpoint={RUN}", *SMALL, folder=folder)
+    assert re.search("metrics.json (is damaged|is no readable)", line)
     path.write_text(before)

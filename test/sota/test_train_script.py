@@ -1,21 +1,24 @@
-"""train.py from an empty folder to a report: what it leaves, that it repeats, and that it never trains twice."""
+"""train.py from an empty folder to a report: its files, repetition, continuation after a stop, loggers."""
 
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import time
+from pathlib import Path
 
 import imageio.v3 as imageio
 import pytest
 import torch
 
 from torchrl_ficreg.data import OfflineTrajectories
-from torchrl_ficreg.trainers import load_world_model
+from torchrl_ficreg.trainers import find_checkpoint, load_world_model
 
 RUN = "runs/two_room_cpu_ficreg_seed0"
 DATA = "data/two_room_32px_20episodes_seed0"
+GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "first_layout.zip"
 
 
 def weights(folder):
@@ -69,10 +72,10 @@ def test_the_same_command_elsewhere_gives_the_same_weights_and_outcomes(trained,
     assert outcomes(trained / RUN) == outcomes(tmp_path / RUN)
 
 
-def test_evaluate_repeats_the_outcome_bit_for_bit(trained, copy, execute, files):
+def test_evaluate_repeats_the_outcome_bit_for_bit(trained, copy, spawn, files):
     """The run's own plan settings, another number of environments; the run's own files stay as they are."""
     before = files(copy)
-    done = execute(copy, "evaluate.py", f"checkpoint={RUN}", "num_envs=3", "record=1")
+    done = spawn(copy, "evaluate.py", f"checkpoint={RUN}", "num_envs=3", "record=1")
     assert done.returncode == 0, done.stderr
     (folder,) = (copy / RUN / "evaluation").iterdir()
     repeated = json.loads((folder / "results.json").read_text())
@@ -100,6 +103,72 @@ def test_a_finished_command_given_again_trains_nothing(copy, execute, files):
     results = json.loads(after["results.json"])
     assert results["policy"]["pairs"] == 3
     assert results["training"]["resumed_at_step"] == results["training"]["steps"]
+
+
+def test_a_preempted_job_exits_with_85_and_the_same_command_ends_as_an_unbroken_one(beside, command, environment, execute):
+    """SIGTERM in the first of two epochs, where no checkpoint of an epoch helps. Success is measured on the way."""
+    line = ["optim.epochs=2", "logger.interval=1", "evaluation.every=1", "evaluation.every_pairs=2"]
+    process = subprocess.Popen(command("train.py", *line), cwd=beside, env=environment, stderr=subprocess.PIPE, text=True)
+    table = beside / RUN / "metrics.csv"
+    while process.poll() is None and not (table.exists() and table.read_bytes().count(b"\n") >= 3):
+        time.sleep(0.001)
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 85
+    assert err.strip().endswith("stopped by SIGTERM: the same command continues where it stopped.")
+    assert "Traceback" not in err
+    (left,) = (beside / RUN / "checkpoints").iterdir()
+    done = execute(beside, "train.py", *line)
+    assert done.returncode == 0, done.stderr
+    assert "continuing" in done.stdout
+    assert not left.exists()
+    assert table.read_text().count("evaluation") == 2
+    find_checkpoint(beside / RUN, best=True)
+    whole = execute(beside, "train.py", "optim.epochs=2", "name=whole")
+    assert whole.returncode == 0, whole.stderr
+    ours, theirs = weights(beside / RUN), weights(beside / "runs" / "whole")
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    text = (beside / RUN / "README.txt").read_text()
+    assert "optim.epochs=2" in text and f"checkpoint={RUN}" in text
+    explained = {line.split()[0].rstrip("/,") for line in text.splitlines() if line and not line.startswith(" ")}
+    assert {path.name for path in (beside / RUN).iterdir()} - {"README.txt"} <= explained
+
+
+def test_resume_never_refuses_what_is_there_and_a_path_begins_from_it(trained, copy, execute):
+    """The run of one epoch, begun from its own last checkpoint under another name, has nothing left to train."""
+    refused = execute(copy, "train.py", "resume=never")
+    assert refused.returncode == 1
+    assert "holds a run and resume=never" in refused.stderr
+    other = execute(copy, "train.py", "name=other", f"resume={RUN}")
+    assert other.returncode == 0, other.stderr
+    assert "train:" not in other.stderr
+    ours, theirs = weights(copy / RUN), weights(trained / RUN)
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    differs = execute(copy, "train.py", "name=third", f"resume={RUN}", "optim.lr=1")
+    assert differs.returncode == 1 and "was made with other settings (optim.lr: 0.0005 -> 1" in differs.stderr
+    absent = execute(copy, "train.py", "name=third", "resume=nowhere")
+    assert absent.returncode == 1 and "no checkpoint at nowhere" in absent.stderr
+    assert not (copy / "runs" / "third").exists()
+
+
+def test_a_run_of_before_can_be_evaluated_and_continued(tmp_path, execute):
+    """Made before modules and scripts were renamed: ``test/golden/first_layout.zip``."""
+    shutil.unpack_archive(GOLDEN, tmp_path)
+    before = weights(tmp_path / RUN)
+    done = execute(tmp_path, "evaluate.py", f"checkpoint={RUN}", "record=0")
+    assert done.returncode == 0, done.stderr
+    (folder,) = (tmp_path / RUN / "evaluation").iterdir()
+    found = json.loads((folder / "results.json").read_text())["policy"]
+    expected = outcomes(tmp_path / RUN)["policy"]
+    assert {key: found[key] for key in ("pairs_hash", "first_success_step")} == {
+        key: expected[key] for key in ("pairs_hash", "first_success_step")
+    }
+    overrides = (tmp_path / RUN / "README.txt").read_text().split("python train.py ")[1].splitlines()[0].split()
+    done = execute(tmp_path, "train.py", *overrides, tiny=False)
+    assert done.returncode == 0, done.stderr
+    assert "train:" not in done.stderr and "collect:" not in done.stderr
+    after = weights(tmp_path / RUN)
+    assert all(torch.equal(before[name], after[name]) for name in before)
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
@@ -139,13 +208,13 @@ def test_a_run_stopped_while_collecting_records_the_same_bytes_when_repeated(
 
 
 @pytest.mark.parametrize("backend", ["tensorboard", "wandb"])
-def test_lewm_trains_and_other_loggers_work(trained, execute, tmp_path, backend):
+def test_lewm_trains_and_other_loggers_work(beside, execute, spawn, backend):
     """The baseline has its own run folder on the same data and no term of FICReg; its logger's files are inside it."""
     pytest.importorskip(backend)
-    (tmp_path / "data").symlink_to(trained / "data")
-    done = execute(tmp_path, "train.py", "method=lewm", f"logger.backend={backend}", "logger.interval=5")
+    run = spawn if backend == "wandb" else execute  # wandb starts a service for the process
+    done = run(beside, "train.py", "method=lewm", f"logger.backend={backend}", "logger.interval=5")
     assert done.returncode == 0, done.stderr
-    run_dir = tmp_path / "runs" / "two_room_cpu_lewm_seed0"
+    run_dir = beside / "runs" / "two_room_cpu_lewm_seed0"
     header = (run_dir / "metrics.csv").read_text().splitlines()[0]
     assert "loss_pred" in header and "loss_idm" not in header and "loss_consistency" not in header
     assert json.loads((run_dir / "results.json").read_text())["method"] == "lewm"
@@ -154,4 +223,4 @@ def test_lewm_trains_and_other_loggers_work(trained, execute, tmp_path, backend)
     if backend == "wandb":
         media = {path.name for path in (run_dir / "wandb").rglob("files/media/*") if any(path.rglob("*.*"))}
         assert media == {"table", "images", "videos"}
-    assert {path.name for path in tmp_path.iterdir()} == {"data", "runs"}
+    assert {path.name for path in beside.iterdir()} == {"data", "runs"}

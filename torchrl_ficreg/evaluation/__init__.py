@@ -1,4 +1,4 @@
-"""Judging a world model: by planning on frozen start-goal pairs, and by the shape of its latent space."""
+"""Evaluation of a world model: success rates of planning on frozen start-goal pairs, and latent distances."""
 
 from torchrl_ficreg.evaluation.metrics import DistanceProfile, latent_distance, rank_correlation, wilson_interval
 from torchrl_ficreg.evaluation.mpc import evaluate_mpc, Evaluation, UniformPolicy

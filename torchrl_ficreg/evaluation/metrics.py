@@ -1,4 +1,4 @@
-"""Success rates with confidence intervals, rank correlation, latent distance against the state."""
+"""Confidence intervals of success rates, rank correlation, and latent distance against true distance."""
 
 from __future__ import annotations
 
@@ -15,9 +15,20 @@ from torchrl_ficreg.modules.world_model import LatentWorldModel
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Confidence interval of a proportion (Wilson, 1927), 95 % by default.
+    """Confidence interval of a proportion (Wilson, 1927).
 
-    Unlike mean plus or minus two standard errors it stays inside [0, 1] and has a width at 0 and at 100 %.
+    Unlike the mean plus or minus two standard errors, it lies within [0, 1] and is not empty at 0 and 100 %.
+
+    Args:
+        successes (int): number of successes.
+        trials (int): number of trials.
+        z (float, optional): quantile of the normal distribution. Default: ``1.959964``, for 95 %.
+
+    Returns:
+        lower and upper bound; (0, 1) without any trial.
+
+    Raises:
+        ValueError: ``successes`` is negative or exceeds ``trials``.
 
     Examples:
         >>> low, high = wilson_interval(85, 100)
@@ -35,9 +46,14 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
 
 
 def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Spearman's rank correlation of two samples [N]; equal values share their mean rank.
+    """Spearman's rank correlation; equal values share their mean rank.
 
-    0 where one sample is constant, for then there is nothing to follow.
+    Args:
+        first (np.ndarray): sample [N].
+        second (np.ndarray): sample [N].
+
+    Returns:
+        the correlation in [-1, 1]; 0 if one sample is constant.
 
     Examples:
         >>> float(rank_correlation(np.array([1.0, 2.0, 5.0]), np.array([0.0, 3.0, 4.0])))
@@ -54,11 +70,11 @@ def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
 
 @dataclass
 class DistanceProfile:
-    """Pairs of frames: how far apart in truth, how far in latent space.
+    """True and latent distances of pairs of frames.
 
     Attributes:
-        true: [P], Euclidean distance between simulator states, their unit.
-        latent: [P], Euclidean distance between latents.
+        true (np.ndarray): Euclidean distances of simulator states [P], in the unit of the state.
+        latent (np.ndarray): Euclidean distances of latents [P].
     """
 
     true: np.ndarray
@@ -66,31 +82,34 @@ class DistanceProfile:
 
     @property
     def rank_correlation(self) -> float:
-        """Spearman's, over all pairs."""
+        """Spearman's rank correlation over all pairs."""
         return rank_correlation(self.true, self.latent)
 
     def bins(self, count: int = 12) -> tuple[np.ndarray, np.ndarray]:
         """Quantiles of the latent distance within bins of true distance.
 
+        Args:
+            count (int, optional): number of bins with equally many pairs; empty ones are left out. Default: ``12``.
+
         Returns:
-            mean true distance [count] and the 10th, 50th and 90th percentile of the latent one [count, 3].
+            mean true distance [count] and 10th, 50th and 90th percentile of the latent distance [count, 3].
         """
         edges = np.quantile(self.true, np.linspace(0, 1, count + 1))
         which = np.clip(np.searchsorted(edges, self.true, side="right") - 1, 0, count - 1)
         kept = [index for index in range(count) if (which == index).any()]
         center = np.array([self.true[which == index].mean() for index in kept])
-        spread = np.array([np.quantile(self.latent[which == index], (0.1, 0.5, 0.9)) for index in kept])
-        return center, spread
+        quantiles = np.array([np.quantile(self.latent[which == index], (0.1, 0.5, 0.9)) for index in kept])
+        return center, quantiles
 
     def summary(self) -> dict[str, Any]:
-        """Plain JSON values; None for what is not finite."""
+        """JSON values: rank correlation and binned distances; None and empty lists if a distance is not finite."""
         if not (np.isfinite(self.true).all() and np.isfinite(self.latent).all()):
             return {"rank_correlation": None, "true_distance": [], "median_latent_distance": []}
-        center, spread = self.bins()
+        center, quantiles = self.bins()
         return {
             "rank_correlation": self.rank_correlation,
             "true_distance": center.round(3).tolist(),
-            "median_latent_distance": spread[:, 1].round(4).tolist(),
+            "median_latent_distance": quantiles[:, 1].round(4).tolist(),
         }
 
 
@@ -98,18 +117,20 @@ class DistanceProfile:
 def latent_distance(
     model: LatentWorldModel, dataset: OfflineTrajectories, *, num_frames: int = 400, seed: int = 0
 ) -> DistanceProfile:
-    """Compares all pairs among some frames of held-out episodes.
+    """Measures true and latent distance for all pairs of some held-out frames.
 
     Args:
-        model: in eval mode.
-        dataset: held-out episodes.
-        num_frames: frames drawn, at most all there are.
-        seed: of the draw.
+        model (LatentWorldModel): world model, in eval mode.
+        dataset (OfflineTrajectories): held-out episodes with states.
+
+    Keyword Args:
+        num_frames (int, optional): number of frames drawn; all frames if there are fewer. Default: ``400``.
+        seed (int, optional): seed of the draw. Default: ``0``.
 
     Raises:
-        ValueError: fewer than two frames.
+        ValueError: fewer than two frames, or episodes without states.
     """
-    dataset.require_state()
+    dataset.store.require_state()
     table = dataset.episodes
     ends = table["length"].cumsum(0)
     total = int(ends[-1]) if len(ends) else 0

@@ -1,4 +1,4 @@
-"""Does the planner reach the goals? Success rates on frozen start-goal pairs."""
+"""Success rates of a policy on frozen start-goal pairs."""
 
 from __future__ import annotations
 
@@ -17,19 +17,24 @@ from tqdm import tqdm
 from torchrl_ficreg.envs import make_env
 from torchrl_ficreg.evaluation.metrics import wilson_interval
 from torchrl_ficreg.evaluation.pairs import StartGoalPairs
-from torchrl_ficreg.keys import ACTION, GOAL_PIXELS, PIXELS, SUCCESS
-from torchrl_ficreg.planners.base import PLAN_SEED
+from torchrl_ficreg.keys import ACTION, GOAL_PIXELS, MPC_MEMORY, PIXELS, PLAN_SEED, SUCCESS
 from torchrl_ficreg.planners.mpc import MPCPolicy
 
 
 class UniformPolicy(TensorDictModuleBase):
-    """Actions drawn uniformly between the bounds: the floor every planner is compared with.
+    """The random baseline: actions drawn uniformly between the bounds.
 
-    Each environment (``plan_seed`` [E], or 0, 1, ...) draws from a generator of its own.
+    Each environment has its own generator, seeded by ``plan_seed`` [E] (0, 1, ... if there is none).
 
     Args:
-        low, high: [A], environment units.
-        seed: of the draws.
+        low (list of float): lower bounds of an action [A], in environment units.
+        high (list of float): upper bounds [A].
+        seed (int, optional): seed of the draws. Default: ``0``.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> UniformPolicy([-1.0, 2.0], [1.0, 6.0])(TensorDict({}, [3]))["action"].shape
+        torch.Size([3, 2])
     """
 
     def __init__(self, low: list[float], high: list[float], seed: int = 0) -> None:
@@ -38,7 +43,7 @@ class UniformPolicy(TensorDictModuleBase):
         self.in_keys, self.out_keys = [], [ACTION]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes ``action`` [E, A] and, under ``random_step``, how many were drawn."""
+        """Writes ``action`` [E, A] and the number of actions drawn so far, ``random_step`` [E]."""
         count = tensordict.get("random_step", torch.zeros(tensordict.batch_size, dtype=torch.long))
         seeds = tensordict.get(PLAN_SEED, torch.arange(count.numel()).reshape(count.shape))
         draws = [
@@ -54,12 +59,12 @@ class Evaluation:
     """Outcome of one policy on N start-goal pairs.
 
     Attributes:
-        success: [N, budget + 1] bool, at the start and after every step.
-        seconds_per_plan: mean wall time of one plan of one environment; 0 for a policy that does not plan.
-        pairs_hash: of the pairs.
-        recorded: rows of the pairs whose episodes were recorded, ascending.
-        frames: these episodes, each [budget + 1, 3, H, W] uint8.
-        goals: their goals, each [3, H, W] uint8.
+        success (np.ndarray): bool [N, budget + 1], whether the goal is reached at the start and after every step.
+        seconds_per_plan (float): mean wall time of one plan of one environment; 0 for a policy that does not plan.
+        pairs_hash (str): :attr:`StartGoalPairs.hash`.
+        recorded (list of int): rows of the pairs whose episodes are recorded, ascending.
+        frames (list of np.ndarray): these episodes, uint8 [budget + 1, 3, H, W] each.
+        goals (list of np.ndarray): their goal images, uint8 [3, H, W] each.
     """
 
     success: np.ndarray
@@ -71,21 +76,21 @@ class Evaluation:
 
     @property
     def ever(self) -> np.ndarray:
-        """[N] bool: in the goal after any step of the budget."""
+        """Bool [N], whether the goal is reached after any step of the budget."""
         return self.success[:, 1:].any(1)
 
     @property
     def at_start(self) -> np.ndarray:
-        """[N] bool: in the goal before the first step."""
+        """Bool [N], whether the goal is reached before the first step."""
         return self.success[:, 0]
 
     @property
     def success_rate(self) -> float:
-        """Share of all pairs solved."""
+        """Share of all pairs whose goal is reached after any step."""
         return float(self.ever.mean())
 
     def summary(self) -> dict[str, Any]:
-        """Plain JSON values; rates in 0..1, intervals by Wilson at 95 %."""
+        """JSON values: counts, rates in [0, 1], a 95 % interval by :func:`wilson_interval`, steps of first success (-1: none)."""
         open_pairs = ~self.at_start
         solved_open = self.ever[open_pairs]
         first = np.where(self.ever, self.success[:, 1:].argmax(1) + 1, -1)
@@ -116,28 +121,34 @@ def evaluate_mpc(
     progress_bar: bool = True,
     description: str = "evaluate",
 ) -> Evaluation:
-    """Lets a policy act from every start state and counts the goals it reaches.
+    """Runs a policy from every start state and counts the goals it reaches.
 
-    Episodes go on after success, so that reaching a goal and staying there are counted separately; an environment that
-    stopped at its goal would count as one that stays. An outcome depends neither on ``num_envs`` nor on
-    ``num_workers``: the policy is told, by ``plan_seed``, which pair it acts for, and the environment is seeded by it.
+    Episodes continue after success, so that reaching a goal and staying there are counted separately. The outcome of a
+    pair depends neither on ``num_envs`` nor on ``num_workers``: the number of the pair is the seed of the environment, and
+    the policy reads it as ``plan_seed``.
 
     Args:
-        policy: reads ``pixels`` and ``goal_pixels``, writes ``action``.
-        pairs: starts and goals.
-        budget: environment steps allowed.
-        image_size: of the frames the policy sees.
-        num_envs: pairs evaluated side by side.
-        num_workers: None to step the environments in this process; W to divide them among W processes, or among as
-            many as there are environments, see :func:`~torchrl_ficreg.envs.make_env`.
-        env_kwargs: further arguments of the environment.
-        record: number of episodes whose frames are kept, k of N: rows 0, N / k, 2 N / k, ... rounded down, since
-            neighbours in the list often come from one recorded episode; at most N.
-        progress_bar, description: of the progress bar.
+        policy (TensorDictModuleBase): reads ``pixels`` and ``goal_pixels``, writes ``action``.
+        pairs (StartGoalPairs): starts and goals.
+
+    Keyword Args:
+        budget (int, optional): number of environment steps allowed. Default: ``50``.
+        image_size (int, optional): height and width of the frames, in pixels. Default: ``64``.
+        num_envs (int, optional): number of pairs evaluated side by side. Default: ``50``.
+        num_workers (int, optional): number of processes that step the environments, at most ``num_envs``; see
+            :func:`~torchrl_ficreg.envs.make_env`. Default: ``None``, this process.
+        env_kwargs (dict, optional): further arguments of the environment. Default: ``None``.
+        record (int, optional): number k of episodes whose frames are kept, at most N: rows 0, N / k, 2 N / k, ... rounded
+            down, since neighbours in the list often come from one recorded episode. Default: ``0``.
+        progress_bar (bool, optional): show a progress bar. Default: ``True``.
+        description (str, optional): text in front of the progress bar. Default: ``"evaluate"``.
+
+    Returns:
+        the :class:`Evaluation`.
 
     Raises:
-        ValueError: ``budget`` or ``num_envs`` below 1, ``num_workers`` too, ``env_kwargs`` that are set here, or a
-            planner that imagines further ahead than ``budget`` steps.
+        ValueError: ``budget``, ``num_envs`` or ``num_workers`` below 1, ``env_kwargs`` that this function sets, or a
+            planning horizon beyond the budget.
     """
     for name, value in (("budget", budget), ("num_envs", num_envs), ("record", record)):
         if not isinstance(value, int) or isinstance(value, bool):
@@ -150,7 +161,7 @@ def evaluate_mpc(
         ahead = policy.planner.config.horizon * policy.planner.world_model.frame_skip
         if ahead > budget:
             raise ValueError(
-                f"the planner imagines {ahead} steps ahead, the budget is {budget}: shorten its horizon (action blocks "
+                f"the planning horizon is {ahead} steps, the budget {budget}: shorten the horizon (action blocks "
                 f"of {policy.planner.world_model.frame_skip} steps), or raise the budget."
             )
     taken = {"image_size", "terminate_on_success", "num_envs", "num_workers", "seed"} & set(env_kwargs or {})
@@ -165,7 +176,7 @@ def evaluate_mpc(
     try:
         for first in range(0, len(pairs), num_envs):
             group = np.arange(first, min(first + num_envs, len(pairs)))
-            if env is None or env.numel() != len(group):  # all groups but the last share one: processes start slowly
+            if env is None or env.numel() != len(group):  # shared by all groups but the last
                 if env is not None:
                     env.close()
                 env = make_env(
@@ -194,17 +205,18 @@ def _run_group(
     outcome: Evaluation,
     bar: tqdm,
 ) -> tuple[float, int]:
-    """Runs the pairs of one group side by side and fills in their rows; returns policy seconds and plans made."""
+    """Runs the pairs of one group and fills in their rows of ``outcome``; returns seconds in the policy and plans made."""
     scenes = [
         {"seed": int(i), "options": {"state": pairs.start_state[i], "goal_state": pairs.goal_state[i]}} for i in group
     ]
     td = env.reset(list_of_kwargs=scenes) if env.batch_size else env.reset(**scenes[0])
     lead = td.batch_size
-    td[PLAN_SEED] = torch.from_numpy(group).reshape(lead)
+    seed_key = policy.tensor_keys.plan_seed if isinstance(policy, MPCPolicy) else PLAN_SEED
+    td[seed_key] = torch.from_numpy(group).reshape(lead)
     kept = [row - int(group[0]) for row in outcome.recorded if row in group]
 
     def pictures(key: str) -> np.ndarray:
-        """Copies of the recorded environments' pictures, [kept, 3, H, W]."""
+        """Copies of the recorded environments' images, [kept, 3, H, W]."""
         return td[key].reshape(len(group), *td[key].shape[-3:])[kept].numpy()
 
     frames = [pictures(PIXELS)]
@@ -221,5 +233,5 @@ def _run_group(
             frames.append(pictures(PIXELS))
         bar.update(len(group))
     outcome.frames += list(np.stack(frames, axis=1)) if kept else []
-    plans = td.get(("mpc", "count"), None)
-    return seconds, 0 if plans is None else int(plans.sum())
+    memory = td.get(policy.tensor_keys.memory if isinstance(policy, MPCPolicy) else MPC_MEMORY, None)
+    return seconds, 0 if memory is None else int(memory["count"].sum())

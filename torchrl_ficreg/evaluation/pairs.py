@@ -1,4 +1,4 @@
-"""Start-goal pairs: drawn once from held-out episodes, then frozen."""
+"""Start-goal pairs, drawn once from held-out episodes and frozen in a file."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ class StartGoalPairs:
     """N start states and, from the same episode some steps later, N goal states.
 
     Attributes:
-        env: name of the environment.
-        goal_offset: environment steps from start to goal.
-        seed: of the draw.
-        fingerprint: of the dataset they were drawn from.
-        episode, step: [N], where each start was found.
-        start_state, goal_state: [N, S] float64, full simulator states.
+        env (str): name of the environment.
+        goal_offset (int): environment steps from start to goal.
+        seed (int): seed of the draw.
+        fingerprint (str): fingerprint of the dataset they were drawn from.
+        episode (np.ndarray): episode of each start, int64 [N].
+        step (np.ndarray): step of each start in its episode, int64 [N].
+        start_state (np.ndarray): full simulator states, float64 [N, S].
+        goal_state (np.ndarray): full simulator states, float64 [N, S].
 
     Raises:
         TypeError: a field of another type.
-        ValueError: no pairs, arrays of other shapes, negative numbers, or states that are not finite.
+        ValueError: no pairs, arrays of wrong shapes, negative numbers, or states that are not finite.
     """
 
     env: str
@@ -75,24 +77,24 @@ class StartGoalPairs:
 
     @property
     def hash(self) -> str:
-        """sha256 of everything above: two results with one hash were measured on the same pairs."""
+        """sha256 of all attributes: results with the same hash were measured on the same pairs."""
         return hashlib.sha256(json.dumps(self._content(), sort_keys=True).encode()).hexdigest()
 
     @classmethod
     def draw(cls, dataset: OfflineTrajectories, env: str, num_pairs: int, goal_offset: int, seed: int) -> StartGoalPairs:
-        """Draws pairs uniformly, without replacement, over all starts that have a goal in their episode.
+        """Draws pairs uniformly, without replacement, from all starts with a goal in the same episode.
 
         Args:
-            dataset: held-out episodes.
-            env: name of their environment.
-            num_pairs: N.
-            goal_offset: environment steps from start to goal.
-            seed: of the draw.
+            dataset (OfflineTrajectories): held-out episodes with states.
+            env (str): name of their environment.
+            num_pairs (int): number N of pairs.
+            goal_offset (int): environment steps from start to goal.
+            seed (int): seed of the draw.
 
         Raises:
             ValueError: fewer than N legal starts.
         """
-        dataset.require_state()
+        dataset.store.require_state()
         table = dataset.episodes
         starts = (table["length"] - goal_offset).clamp_min(0).numpy()  # legal starts of each episode
         total = int(starts.sum())
@@ -115,10 +117,18 @@ class StartGoalPairs:
     def frozen(
         cls, path: Path, dataset: OfflineTrajectories, env: str, num_pairs: int, goal_offset: int, seed: int
     ) -> StartGoalPairs:
-        """The pairs of a manifest; draws them and writes it when there is none.
+        """Reads pairs from a file; if it does not exist, draws them and writes it.
+
+        Args:
+            path (Path): JSON file, see :meth:`save`.
+            dataset (OfflineTrajectories): as for :meth:`draw`.
+            env (str): as for :meth:`draw`.
+            num_pairs (int): as for :meth:`draw`.
+            goal_offset (int): as for :meth:`draw`.
+            seed (int): as for :meth:`draw`.
 
         Raises:
-            ValueError: the manifest belongs to another dataset or another draw, or was changed by hand.
+            ValueError: the file belongs to another dataset or another draw, or was changed by hand.
         """
         if not path.exists():
             pairs = cls.draw(dataset, env, num_pairs, goal_offset, seed)
@@ -135,7 +145,7 @@ class StartGoalPairs:
         return pairs
 
     def save(self, path: Path) -> None:
-        """Writes the manifest in one piece, also where several runs write the same one at once.
+        """Writes the pairs to a JSON file, atomically: several runs may write the same file at once.
 
         A link in its place is replaced, not followed.
         """
@@ -145,10 +155,10 @@ class StartGoalPairs:
 
     @classmethod
     def load(cls, path: Path) -> StartGoalPairs:
-        """Reads a manifest.
+        """Reads pairs from a file.
 
         Raises:
-            ValueError: it is not one, or its hash does not fit its content.
+            ValueError: it holds no pairs, or its hash does not fit its content.
         """
         try:
             content: dict[str, Any] = read_json(path, "manifest")
@@ -162,6 +172,6 @@ class StartGoalPairs:
         return pairs
 
     def _content(self) -> dict[str, Any]:
-        # Floats survive: json writes the shortest text that reads back as the same double.
+        # JSON keeps floats exactly: it writes the shortest text that is read back as the same double.
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}

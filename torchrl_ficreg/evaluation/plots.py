@@ -1,4 +1,4 @@
-"""Pictures of a run. Needs the ``plot`` extra (matplotlib and imageio)."""
+"""Plots of a run and a GIF of its episodes. Needs the ``plot`` extra (matplotlib and imageio)."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def _pyplot():
 
 
 def plot_learning_curve(metrics: Path, target: Path) -> None:
-    """One panel per loss term of a ``metrics.csv``: training as a line, validation as dots, logarithmic.
+    """Plots every loss term of a ``metrics.csv`` on a logarithmic axis: training as a line, validation as dots.
 
     Args:
-        metrics: the table that :class:`~torchrl_ficreg.trainers.OfflineTrainer` writes.
-        target: PNG to write.
+        metrics (Path): the table of an :class:`~torchrl_ficreg.trainers.OfflineTrainer`.
+        target (Path): PNG file to write.
 
     Raises:
         ImportError: matplotlib is missing.
@@ -59,23 +59,23 @@ def plot_learning_curve(metrics: Path, target: Path) -> None:
 
 
 def plot_latent_distance(profile: DistanceProfile, target: Path, unit: str = "state distance") -> None:
-    """Latent distance against true distance: median and 10-90 % band over pairs of held-out frames.
+    """Plots latent distance against true distance: median and 10-90 % band over pairs of held-out frames.
 
-    A planner follows this curve downhill; where it is flat, it has no slope to follow.
+    A planner that minimises latent distance makes progress where this curve rises, and none where it is flat.
 
     Args:
-        profile: see :func:`~torchrl_ficreg.evaluation.metrics.latent_distance`.
-        target: PNG to write.
-        unit: label of the true distance.
+        profile (DistanceProfile): the distances, see :func:`~torchrl_ficreg.evaluation.latent_distance`.
+        target (Path): PNG file to write.
+        unit (str, optional): axis label of the true distance. Default: ``"state distance"``.
 
     Raises:
         ImportError: matplotlib is missing.
     """
     pyplot = _pyplot()
-    center, spread = profile.bins(count=24)
+    center, quantiles = profile.bins(count=24)
     figure, axis = pyplot.subplots(figsize=(4.5, 3.4))
-    axis.fill_between(center, spread[:, 0], spread[:, 2], alpha=0.25, label="10-90 %")
-    axis.plot(center, spread[:, 1], label="median")
+    axis.fill_between(center, quantiles[:, 0], quantiles[:, 2], alpha=0.25, label="10-90 %")
+    axis.plot(center, quantiles[:, 1], label="median")
     axis.set(xlabel=unit, ylabel="latent distance", xlim=(0, None), ylim=(0, None))
     axis.set_title(f"rank correlation {profile.rank_correlation:.2f}")
     axis.grid(alpha=0.3)
@@ -84,14 +84,16 @@ def plot_latent_distance(profile: DistanceProfile, target: Path, unit: str = "st
 
 
 def save_episodes_gif(evaluation: Evaluation, target: Path, *, scale: int = 2, fps: int = 10, columns: int = 4) -> None:
-    """Recorded episodes side by side, each the agent's view beside its goal; the frame turns green on success.
+    """Writes a GIF of the recorded episodes, each beside its goal image; the border turns green on success.
 
     Args:
-        evaluation: with recorded frames.
-        target: GIF to write.
-        scale: every pixel becomes scale x scale.
-        fps: frames per second.
-        columns: episodes in a row.
+        evaluation (Evaluation): an evaluation with recorded episodes.
+        target (Path): GIF file to write.
+
+    Keyword Args:
+        scale (int, optional): factor by which images are enlarged. Default: ``2``.
+        fps (int, optional): frames per second. Default: ``10``.
+        columns (int, optional): number of episodes in a row. Default: ``4``.
 
     Raises:
         ImportError: imageio is missing.
@@ -113,13 +115,13 @@ def save_episodes_gif(evaluation: Evaluation, target: Path, *, scale: int = 2, f
         tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
         rows = [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)]
         pictures.append(np.concatenate(rows))
-    pictures += [pictures[-1]] * fps  # a second to look at the end
+    pictures += [pictures[-1]] * fps  # one second of the last frame
     movie = imageio.imwrite("<bytes>", np.stack(pictures), extension=".gif", duration=1000 // fps, loop=0)
     write_atomic(target, movie)
 
 
 def _tile(frame: np.ndarray, goal: np.ndarray, reached: bool, scale: int) -> np.ndarray:
-    """View and goal [3, H, W] -> framed picture [h, w, 3]."""
+    """Image and goal image [3, H, W] -> bordered picture [h, w, 3]."""
     pair = np.concatenate([frame, goal], axis=2).transpose(1, 2, 0).repeat(scale, 0).repeat(scale, 1)
     color = (40, 160, 70) if reached else (190, 190, 190)
     framed = np.full((pair.shape[0] + 8, pair.shape[1] + 8, 3), 255, dtype=np.uint8)

@@ -1,10 +1,12 @@
-"""Claims about devices, where there is no GPU: a model on CUDA plans for environments on the CPU, and is trained there."""
+"""Claims about devices, shown by a mock where there is no GPU: planning and losses never mix CPU and CUDA tensors."""
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import pytest
 import torch
-from pretend_cuda import CUDA, MixedDevices, PretendCuda, to_cuda
+from mock_cuda import CUDA, MixedDevices, MockCuda, to_cuda
 from scenes import same_room_pairs
 
 from torchrl_ficreg import FICRegLoss, GoalPolicy, make_world_model, ModelConfig, MPCPolicy
@@ -25,8 +27,8 @@ SIZES = ModelConfig(
 )
 
 
-def test_the_pretended_device_refuses_what_cuda_refuses():
-    with PretendCuda():
+def test_the_mocked_device_refuses_what_cuda_refuses():
+    with MockCuda():
         here, there = torch.ones(2), torch.ones(2).to("cuda")
         assert there.device == CUDA and (there * 2).device == CUDA and here.device.type == "cpu"
         assert (there.cpu() + here).device.type == "cpu" and torch.zeros(2, device=CUDA).device == CUDA
@@ -44,7 +46,8 @@ def test_a_model_on_cuda_plans_for_environments_on_the_cpu(monkeypatch, search, 
     policy = GoalPolicy(latent_dim=4, action_dim=4) if search == "policy" else None
     kind = SEARCHES[search].config_class
     settings = {"num_candidates": 8, "num_elites": 4, "iterations": 2, "horizon": 2, "receding_horizon": 1}
-    config = kind(**settings, history=history, precision="fp32")
+    known = {field.name for field in fields(kind)} & settings.keys()
+    config = kind(**{name: settings[name] for name in known}, history=history, precision="fp32")
     planner = SEARCHES[search](model.eval(), config, action_bounds=([-1, -1], [1, 1]), policy=policy)
 
     def outcome():
@@ -53,7 +56,7 @@ def test_a_model_on_cuda_plans_for_environments_on_the_cpu(monkeypatch, search, 
     expected = outcome()
     make = common.make_generator  # of a device that is not there none can be made
     monkeypatch.setattr(common, "make_generator", lambda seed, environment, device: make(seed, environment, torch.device("cpu")))
-    with PretendCuda():
+    with MockCuda():
         to_cuda(planner)
         found = outcome()
     assert torch.tensor(found.success).equal(torch.tensor(expected.success))
@@ -64,7 +67,7 @@ def test_a_loss_on_cuda_computes_on_cuda():
     loss = FICRegLoss(model.encoder, model.predictor, inverse_model, diagnostics=True)
     pixels = torch.randint(0, 256, (4, 3, 3, 16, 16), dtype=torch.uint8)
     clip = {"pixels": pixels, "action": torch.randn(4, 3, 4), "mask": torch.ones(4, 3, dtype=torch.bool)}
-    with PretendCuda():
+    with MockCuda():
         to_cuda(loss)
         output = loss(**{name: value.to("cuda") for name, value in clip.items() if name != "mask"})
         for value in output if isinstance(output, tuple) else output.values():

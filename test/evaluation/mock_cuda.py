@@ -1,8 +1,8 @@
-"""A CUDA device for machines without one: tensors on the CPU that say otherwise, and refuse what CUDA would refuse.
+"""A mock of a CUDA device for machines without one: it finds mixed devices, and nothing else that a GPU would show.
 
-Inside :class:`PretendCuda`, tensors that were moved to ``cuda`` carry a tag. Operations hand it on, and raise
-:class:`MixedDevices` where a real device would: two tensors of both kinds in one operation, an index on the device into a
-tensor that is not, a NumPy view of the device's memory.
+Inside :class:`MockCuda`, tensors that were moved to ``cuda`` are on the CPU and carry a tag. Operations pass it on, and raise
+:class:`MixedDevices` where CUDA would raise: tensors of both devices in one operation, an index on the device into a tensor
+on the CPU, a NumPy view of the device's memory.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ CUDA = torch.device("cuda", 0)
 _LOOKS = "__get__ __set__ dim size stride numel __len__ is_floating_point is_complex type tolist item __repr__ data_ptr "
 _LOOKS += "requires_grad_ untyped_storage element_size __bool__ __float__ __int__ __index__ is_contiguous __format__ "
 _LOOKS += "__hash__ is_inference is_pinned get_device _is_view __deepcopy__ copy_"
-_here = WeakIdKeyDictionary()  # tensors on the pretended device
+_here = WeakIdKeyDictionary()  # tensors on the mocked device
 
 
 class MixedDevices(RuntimeError):
-    """What CUDA would have raised."""
+    """Raised where CUDA would raise."""
 
 
 def to_cuda(module: nn.Module) -> nn.Module:
@@ -33,11 +33,11 @@ def to_cuda(module: nn.Module) -> nn.Module:
     return module
 
 
-class PretendCuda(TorchFunctionMode):
-    """Context in which there is a CUDA device."""
+class MockCuda(TorchFunctionMode):
+    """Context in which ``cuda`` is the mocked device."""
 
     def __torch_function__(self, func, types, args=(), kwargs=None) -> Any:
-        """Every function of torch comes by here."""
+        """Called for every function of torch."""
         kwargs, name = dict(kwargs or {}), getattr(func, "__name__", str(func))
         if func == torch.Tensor.device.__get__:
             return CUDA if args[0] in _here else func(*args)

@@ -1,20 +1,20 @@
 #!/usr/bin/env bash
-# LeWM and FICReg on TwoRoom and PushT on one CUDA machine that has torch and needs no network.
+# LeWM and FICReg on TwoRoom and PushT, on one CUDA machine with torch and without network.
 #
 #   sota-check/run_ficreg_gpu.sh                  a slot of ten minutes; the same command continues in the next slot
 #   sota-check/run_ficreg_gpu.sh --minutes 60     another length
 #   sota-check/run_ficreg_gpu.sh --dry-run        everything in tiny sizes, on the CPU
 #
-# Episodes are recorded on all cores; both methods share them, and the frozen start-goal pairs drawn from them. Then
-# four runs with model=gpu_short, each trained and evaluated by train.py, and a profile of a training step.
+# Records episodes on all cores, for both methods, and draws frozen start-goal pairs. Then trains and evaluates four runs
+# with model=gpu_short (train.py), and profiles a training step.
 #
-#   --out DIR     report: ficreg_gpu.json, pictures, log.txt, few and small; default $OUT, else <work>/report. It is at
-#                 most a minute old at any moment; pictures come at the end, and not where matplotlib cannot be had
+#   --out DIR     report: ficreg_gpu.json, pictures, log.txt; default $OUT, else <work>/report. Updated every minute;
+#                 pictures are drawn at the end, if matplotlib is available
 #   --work DIR    episodes and runs, which the next slot needs (10 GB); default runs/gpu_short
-#   --wheels DIR  wheels of what is missing beside torch; default sota-check/wheels
-#   --fetch       on a machine with a network: fill that folder, 50 MB, for Linux on x86_64 with Python 3.12; no more
+#   --wheels DIR  wheels of missing packages; default sota-check/wheels
+#   --fetch       only fill that folder (50 MB, for Linux on x86_64 with Python 3.12), on a machine with a network
 #
-# Exit code 0: all is done. 75: time was up, give the same command again. Anything else: an error, in log.txt.
+# Exit code 0: finished. 75: the slot ended, run the same command again. Otherwise: an error, in log.txt.
 set -euo pipefail
 began=$(date +%s)
 root=$(cd "$(dirname "$0")/.." && pwd)
@@ -33,7 +33,7 @@ while [ $# -gt 0 ]; do
   esac
 done
 
-# Module, package and version of each thing needed beside torch, and what these need in turn; then those of pictures.
+# Module, package and version of all required packages but torch, with their dependencies; then those of pictures.
 needed='torchrl:torchrl==0.14.1 tensordict:tensordict==0.14.3 hoptorch:hoptorch==0.1.4 pyvers:pyvers==0.2.3
   cloudpickle:cloudpickle==3.1.2 orjson:orjson==3.13.0 importlib_metadata:importlib-metadata==10.2.0
   lazy_importer:lazy-importer==0.1.0 zipp:zipp==4.1.2 packaging:packaging==26.3 numpy:numpy==2.4.6 tqdm:tqdm==4.70.1
@@ -62,11 +62,11 @@ work=${work:-$root/runs/$kind}
 mkdir -p "$work" "${out:=$work/report}"
 work=$(cd "$work" && pwd) out=$(cd "$out" && pwd)
 
-export PYTHONPATH=$root:$work/site${PYTHONPATH:+:$PYTHONPATH} PYTHONUNBUFFERED=1
+export PYTHONPATH=$root:$root/benchmarks:$work/site${PYTHONPATH:+:$PYTHONPATH} PYTHONUNBUFFERED=1
 "$python" -c 'import torch' 2> /dev/null ||
   { echo "error: $python has no torch; name another by PYTHON=..." >&2; exit 2; }
 
-# Not a venv: made from one, it would not see that one's torch. Wheels of other versions do as well.
+# No venv: created from another venv, it would not contain that one's torch. Installed packages of other versions are accepted.
 missing() {
   "$python" - "$@" <<'PYTHON'
 import importlib.util, re, sys
@@ -87,4 +87,4 @@ lack=$(missing $pictures)
 if [ -n "$lack" ]; then  # shellcheck disable=SC2086
   add $lack 2> /dev/null || true  # the slot says at its end that pictures are skipped
 fi
-exec "$python" "$root/sota-check/ficreg_gpu.py" --work "$work" --out "$out" ${options[@]+"${options[@]}"}
+exec "$python" "$root/tools/gpu/ficreg_gpu.py" --work "$work" --out "$out" ${options[@]+"${options[@]}"}

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# FICReg against LeWM on TwoRoom, same data, same frozen pairs: three seeds each.
-# Writes docs/results/two_room.json. Finished runs are not repeated; an interrupted one continues.
+# FICReg and LeWM on TwoRoom, three seeds each, on the same data and frozen pairs.
+# Writes docs/results/two_room.json. Finished runs are skipped; interrupted ones continue.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python}
@@ -10,4 +10,4 @@ for seed in ${SEEDS:-0 1 2}; do
     [ -f "$run/results.json" ] || "$python" sota-implementations/ficreg/train.py method="$method" seed="$seed"
   done
 done
-"$python" sota-check/summarize.py two_room 'runs/two_room_cpu_*_seed*/results.json'
+"$python" tools/study/summarize.py two_room 'runs/two_room_cpu_*_seed*/results.json'

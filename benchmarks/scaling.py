@@ -1,7 +1,7 @@
-"""What a training step costs, measured on this CPU, and what the paper's runs would take on GPUs: docs/results/scaling.json.
+"""Cost of a training step, measured on this CPU, and modelled time of the paper's runs on GPUs: docs/results/scaling.json.
 
 Measured: operations, dispatched operators and bytes kept for the backward pass, of the layers as a GPU runs them, and
-seconds of processor time on one thread. Modelled: everything about GPUs, by ``step_seconds`` below. No GPU was at hand for it.
+seconds of processor time on one thread. Modelled: all numbers about GPUs, by ``step_seconds`` below; they were not measured.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from torchrl_ficreg.trainers import OfflineTrainer
 
 RESULT = Path(__file__).resolve().parents[1] / "docs" / "results" / "scaling.json"
 FRAMES, ACTIONS, BATCH, EPOCHS = 4, 2, 128, 10
-# Clips in all the published data, of one frame more than the latents a predictor sees there, 5 steps apart: an episode of
-# n rows holds n - 19 of four frames, n - 9 of two.
+# Number of clips in the published data and history of the predictor there. Clips have history + 1 frames, 5 steps apart: an
+# episode of n rows holds n - 19 clips of four frames, n - 9 of two.
 CLIPS = {"two_room": (830_809, 1), "push_t": (1_981_721, 3), "reacher": (1_820_000, 3), "cube": (1_820_000, 3)}
 PRESETS = {
     "cpu": ModelConfig.preset("cpu"),
@@ -38,8 +38,8 @@ PRESETS = {
 GPU = {
     "name": "H100 or H200 SXM",
     "peak": 990e12,  # operations per second
-    "share": 0.2,  # of the peak, reached by the matrix products of a step with all its other work in between
-    "launch": 4e-6,  # seconds in which a host starts one operator; CUDA graphs take most of it away
+    "share": 0.2,  # utilization: rate of the matrix products of a step relative to the peak
+    "launch": 4e-6,  # seconds to launch one operator, without CUDA graphs
     "bandwidth": 200e9,  # bytes per second of an all-reduce, within a machine
     "bandwidth_between_machines": 40e9,  # of 8 GPUs each
 }
@@ -49,7 +49,7 @@ def main() -> None:
     """Measures, models, prints and writes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--quick", action="store_true", help="smallest sizes only, to see it run; writes no default file")
+    parser.add_argument("--quick", action="store_true", help="smallest sizes only, to check that it runs; writes no file by default")
     parser.add_argument("--out", type=Path, help=f"default: {RESULT}")
     arguments = parser.parse_args()
     out = arguments.out or (None if arguments.quick else RESULT)
@@ -67,7 +67,7 @@ def main() -> None:
     measured["presets, 4 clips"] = {name: measure(config, 4, 1) for name, config in presets.items()}
     rows = {name: [measured[key][name] for key in ("presets", "presets, 4 clips")] for name in presets}
     if "gpu_short" in rows:
-        rows["gpu_short"] = measured["batch"]  # the same model, and 8 clips too
+        rows["gpu_short"] = measured["batch"]  # the same model, also with 8 clips
     result = {
         "measured": measured,
         "modelled": {"gpu": GPU, "memory": memory(rows), "runs": runs(measured["presets"])},
@@ -136,7 +136,7 @@ def measure(config: ModelConfig, clips: int, repeats: int) -> dict[str, Any]:
 
 
 def kept_bytes(trainer: OfflineTrainer, clip: TensorDictBase) -> int:
-    """Bytes that the forward pass keeps for the backward pass, the weights apart; each storage once."""
+    """Bytes saved by the forward pass for the backward pass, without weights; each storage counts once."""
     weights = {p.untyped_storage().data_ptr() for p in trainer.loss_module.parameters()}
     kept: dict[int, int] = {}
 
@@ -152,7 +152,7 @@ def kept_bytes(trainer: OfflineTrainer, clip: TensorDictBase) -> int:
 
 
 class _Dispatched(TorchDispatchMode):
-    """Counts the operators of a step that are not mere views: on a GPU most are a kernel each, unless compiled."""
+    """Counts the operators of a step that are not views; without compilation most are one kernel on a GPU."""
 
     count = 0
 
@@ -162,7 +162,7 @@ class _Dispatched(TorchDispatchMode):
 
 
 def step_seconds(row: dict[str, Any], gpus: int) -> float:
-    """Modelled seconds of one step of 128 clips on some GPUs: the slower of computing and launching, then all-reduce."""
+    """Modelled seconds of one step of 128 clips: the maximum of computing and launching, plus the all-reduce."""
     compute = row["operations"] / row["clips"] * BATCH / gpus / (GPU["peak"] * GPU["share"])
     launch = row["operators"] * GPU["launch"]
     gradients = row["state_bytes"] / 4
@@ -172,10 +172,10 @@ def step_seconds(row: dict[str, Any], gpus: int) -> float:
 
 
 def memory(rows: dict[str, list[dict[str, Any]]]) -> dict[str, dict[str, float]]:
-    """Modelled bytes of training with 128 clips on one GPU: the line through what was measured for few, drawn on.
+    """Modelled bytes of training with 128 clips on one GPU, extrapolated linearly from a few clips.
 
     Args:
-        rows: of each model, measurements with two numbers of clips or more.
+        rows: for each model, measurements with at least two numbers of clips.
     """
     result = {}
     for name, measured in rows.items():

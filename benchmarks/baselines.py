@@ -1,7 +1,8 @@
-"""The objective as one writes it first, on the weights of ours: nothing but textbook layers.
+"""Baselines: the networks and the objective in plain PyTorch, on the weights of this package.
 
-A transformer whose attention is :func:`textbook` or :func:`fused`, one sine and one cosine for every knot of SIGReg, no kernel of the
-package. Shapes: N rows, T tokens, C channels.
+Attention is :func:`textbook` (the formula) or :func:`fused` (``scaled_dot_product_attention``); SIGReg computes one sine and one
+cosine for every knot. Nothing of this package but its weights and its random directions is used. Shapes: N rows, T tokens,
+C channels.
 """
 
 from __future__ import annotations
@@ -30,36 +31,36 @@ def plain_terms(loss: FICRegLoss, clip: TensorDictBase, mix: Mix) -> dict[str, t
         clip: ``pixels`` [B, T, 3, H, W] uint8 and ``action`` [B, T, F * A].
         mix: :func:`textbook` or :func:`fused`.
     """
-    encoder, predictor, judge = (parts(loss, name) for name in ("encoder", "predictor", "inverse_model"))
+    encoder, predictor, inverse_model = (parts(loss, name) for name in ("encoder", "predictor", "inverse_model"))
     action = clip["action"][:, :-1]  # [B, T - 1, F * A]
     latent = plain_encoder(encoder, clip["pixels"], mix)  # [B, T, D]
     predicted = plain_predictor(predictor, latent[:, :-1], action, mix)  # [B, T - 1, D]
     sigreg = plain_sigreg(latent.transpose(0, 1).float(), directions(loss, latent.shape[-1]))
     real = latent.detach()
-    recovered = judge(real[:, :-1], real[:, 1:])
+    recovered = inverse_model(real[:, :-1], real[:, 1:])
     imagined = plain_predictor(predictor, real[:, :-1], action, mix, track=False)
-    for param in judge.parameters():
+    for param in inverse_model.parameters():
         param.requires_grad_(False)
-    judged = judge(real[:, :-1], imagined)
-    for param in judge.parameters():
+    recovered_imagined = inverse_model(real[:, :-1], imagined)
+    for param in inverse_model.parameters():
         param.requires_grad_(True)
     return {
         "loss_pred": F.mse_loss(predicted.float(), latent[:, 1:].float()),
         "loss_sigreg": loss.sigreg_coeff * sigreg,
         "loss_idm": loss.idm_coeff * F.mse_loss(recovered.float(), action),
-        "loss_consistency": loss.consistency_coeff * F.mse_loss(judged.float(), action),
+        "loss_consistency": loss.consistency_coeff * F.mse_loss(recovered_imagined.float(), action),
     }
 
 
 def parts(loss: FICRegLoss, name: str) -> nn.Module:
-    """The network of that name, holding the parameters that the loss trains."""
+    """The network of that name, with the parameters that the loss trains."""
     network = getattr(loss, name)
     getattr(loss, f"{name}_params").to_module(network, preserve_module_state=False)
     return network.module
 
 
 def directions(loss: FICRegLoss, dim: int) -> torch.Tensor:
-    """Unit vectors [D, M], those our own regulariser would draw, by torch's own generator once training began."""
+    """Unit vectors [D, M]: at the first call those that SIGReg draws, later ones from torch's global generator."""
     state, count = loss.sigreg.generator_state, dim * loss.sigreg.num_directions
     drawn = standard_normal(state, count) if state[1] == 0 else torch.randn(count)
     loss.sigreg.generator_state[1] += 1
@@ -68,7 +69,7 @@ def directions(loss: FICRegLoss, dim: int) -> torch.Tensor:
 
 
 def plain_sigreg(latent: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-    """Latents [T, B, D] float32 -> the statistic []."""
+    """Latents [T, B, D] float32 and directions [D, M] -> the statistic [], as published (arXiv 2511.08544)."""
     with torch.autocast("cpu", enabled=False):
         knots = torch.linspace(0, 3, 17)
         weights = torch.full((17,), 2 * 3 / 16)
@@ -77,6 +78,17 @@ def plain_sigreg(latent: torch.Tensor, directions: torch.Tensor) -> torch.Tensor
         angle = (latent @ directions).unsqueeze(-1) * knots  # [T, B, M, 17]
         error = (angle.cos().mean(-3) - gaussian).square() + angle.sin().mean(-3).square()  # [T, M, 17]
         return ((error @ (weights * gaussian)) * latent.shape[-2]).mean()
+
+
+class PlainSIGReg(nn.Module):
+    """:func:`plain_sigreg` with 1,024 random directions."""
+
+    def forward(self, latent: torch.Tensor, directions: torch.Tensor | None = None) -> torch.Tensor:
+        """Latents [T, B, D] -> []."""
+        if directions is None:
+            directions = torch.randn(latent.shape[-1], 1024)
+            directions = directions / directions.norm(dim=0)
+        return plain_sigreg(latent, directions)
 
 
 def plain_encoder(network: nn.Module, pixels: torch.Tensor, mix: Mix) -> torch.Tensor:
@@ -97,7 +109,7 @@ def plain_encoder(network: nn.Module, pixels: torch.Tensor, mix: Mix) -> torch.T
 
 
 def plain_convolutions(network: nn.Module, frames: torch.Tensor) -> torch.Tensor:
-    """The small encoders: [N, 3, H, W] -> [N, D], in the layout that frames come in."""
+    """The small encoders: [N, 3, H, W] -> [N, D], in the memory layout of the frames."""
     maps = network.convolutions(frames)
     if hasattr(network, "projector"):
         return plain_projector(network.projector, maps.flatten(1))
@@ -111,7 +123,15 @@ def plain_convolutions(network: nn.Module, frames: torch.Tensor) -> torch.Tensor
 def plain_predictor(
     network: nn.Module, latent: torch.Tensor, action: torch.Tensor, mix: Mix, *, track: bool = True
 ) -> torch.Tensor:
-    """The predictor as a textbook writes it: [B, T, D] and [B, T, F * A] -> [B, T, D]."""
+    """The predictor as a textbook writes it: [B, T, D] and [B, T, F * A] -> [B, T, D]; in the mode of the network.
+
+    Args:
+        network: the predictor's network, whose weights are used.
+        latent: [B, T, D].
+        action: [B, T, F * A].
+        mix: :func:`textbook` or :func:`fused`.
+        track: whether BatchNorm layers in training mode update their running statistics.
+    """
     x = network.to_width(latent) + network.position[:, : latent.shape[1]]
     embedding = network.action_embedding
     condition = embedding.layer_out(F.silu(embedding.layer_in(embedding.compress(action))))
@@ -149,27 +169,27 @@ def plain_attention(layer: nn.Module, x: torch.Tensor, mix: Mix, causal: bool) -
     projected = F.linear(x, layer.to_qkv.weight, layer.to_qkv.bias)
     query, key, value = (part.unflatten(-1, (layer.heads, -1)).transpose(1, 2) for part in projected.chunk(3, dim=-1))
     mixed = mix(query, key, value, causal).transpose(1, 2).flatten(2)
-    return F.dropout(F.linear(mixed, layer.to_out.weight, layer.to_out.bias), layer.dropout.p)
+    return F.dropout(F.linear(mixed, layer.to_out.weight, layer.to_out.bias), layer.dropout.p, layer.training)
 
 
 def plain_mlp(layers: nn.Sequential, x: torch.Tensor) -> torch.Tensor:
     """[N, T, C] -> [N, T, C]."""
-    rate = layers[2].p
-    hidden = F.dropout(F.gelu(F.linear(x, layers[0].weight, layers[0].bias)), rate)
-    return F.dropout(F.linear(hidden, layers[3].weight, layers[3].bias), rate)
+    rate, training = layers[2].p, layers.training
+    hidden = F.dropout(F.gelu(F.linear(x, layers[0].weight, layers[0].bias)), rate, training)
+    return F.dropout(F.linear(hidden, layers[3].weight, layers[3].bias), rate, training)
 
 
 def plain_projector(layer: nn.Module, x: torch.Tensor, track: bool = True) -> torch.Tensor:
     """[N, C] -> [N, D]."""
     norm = layer.norm
-    statistics = (norm.running_mean, norm.running_var) if track else (None, None)
+    statistics = (norm.running_mean, norm.running_var) if track or not norm.training else (None, None)
     hidden = F.linear(x, layer.layer_in.weight, layer.layer_in.bias)
-    hidden = F.gelu(F.batch_norm(hidden, *statistics, norm.weight, norm.bias, training=True))
+    hidden = F.gelu(F.batch_norm(hidden, *statistics, norm.weight, norm.bias, norm.training))
     return F.linear(hidden, layer.layer_out.weight, layer.layer_out.bias)
 
 
 def plain_precisions() -> list[Precision]:
-    """Those in which a plain formulation may be the best: not bfloat16 where its products take over twice as long."""
+    """Precisions in which the plain formulation may be fastest; without bfloat16 where its products take over twice as long."""
     return ["fp32", "bf16"] if bf16_speedup() > 0.5 else ["fp32"]
 
 

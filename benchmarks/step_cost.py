@@ -1,4 +1,4 @@
-"""What one training step costs: operations of its matrix products, and the rate a device can do them at."""
+"""Cost of a training step: operations of its matrix products, and a device's rate for them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-from torchrl_ficreg.modules import kernels, transformer
+from torchrl_ficreg.modules import transformer
 from torchrl_ficreg.trainers import OfflineTrainer
 
 
@@ -21,7 +21,7 @@ def take_step(trainer: OfflineTrainer, clip: TensorDictBase) -> None:
     """Forward, backward, clipping and update, as in training and without its bookkeeping.
 
     Args:
-        trainer: whose networks are moved.
+        trainer: its networks are updated.
         clip: [B, T] on the trainer's device.
     """
     trainer.optimization_stepper.step(trainer, clip)
@@ -36,25 +36,23 @@ def operations_of_step(trainer: OfflineTrainer, clip: TensorDictBase) -> int:
 
 @contextmanager
 def without_cpu_kernels(*, fused: bool = False) -> Iterator[None]:
-    """Layers as a GPU runs them: what the package does to save time on CPUs would be counted as work.
+    """Attention as a GPU computes it, so that operations and memory do not depend on the processor at hand.
 
     Args:
-        fused: attention by torch's fused kernel, whose products cannot be counted, and which keeps no weights.
+        fused: by torch's fused kernel also on CPUs, where its products cannot be counted; it keeps no weights.
     """
 
     def attend(query, key, value, causal, dropout=0.0):
+        if query.device.type == "cpu" and not fused:
+            return transformer.attend_by_products(query, key, value, causal, dropout)
         return F.scaled_dot_product_attention(query, key, value, is_causal=causal, dropout_p=dropout)
 
-    with (
-        patch.object(kernels, "trains_on_cpu", lambda x: False),
-        patch.object(transformer, "suits_packed_attention", lambda x: False),
-        patch.object(transformer, "attend", attend if fused else transformer.attend),
-    ):
+    with patch.object(transformer, "attend", attend):
         yield
 
 
 class _Counter(TorchDispatchMode):
-    """Counts by torch's own formulas; its FlopCounterMode asks every module for its truth, which a tensordict refuses."""
+    """Counts by torch's own formulas. Its FlopCounterMode evaluates ``bool(output)``, which a tensordict does not support."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -69,7 +67,7 @@ class _Counter(TorchDispatchMode):
 
 
 def state_bytes(trainer: OfflineTrainer) -> int:
-    """Bytes of what training keeps from step to step: weights, gradients and the optimiser's two moments."""
+    """Bytes that training keeps between steps: weights, gradients and the optimizer state (two numbers for each weight)."""
     return sum(4 * p.numel() * p.element_size() for p in trainer.loss_module.parameters() if p.requires_grad)
 
 
@@ -77,17 +75,17 @@ def matrix_rate(device: torch.device, dtype: torch.dtype = torch.bfloat16, size:
     """Operations per second of a large matrix product of random numbers, the best of a few.
 
     Args:
-        device: where.
-        dtype: of the factors.
-        size: rows and columns; 8192 fills a large GPU.
-        repeats: how many.
+        device: device of the matrices.
+        dtype: dtype of the matrices.
+        size: number of rows and columns; 8192 saturates a large GPU.
+        repeats: number of products.
     """
     a, b = torch.randn(2, size, size, device=device).to(dtype)
     return 2 * size**3 / min(seconds(lambda: a @ b, device) for _ in range(repeats))
 
 
 def seconds(function: Callable[[], object], device: torch.device) -> float:
-    """Wall time of a call, what it leaves running on the device included."""
+    """Wall time of a call, with the asynchronous work that it starts on the device."""
     wait_for(device)
     began = time.perf_counter()
     function()
@@ -96,6 +94,6 @@ def seconds(function: Callable[[], object], device: torch.device) -> float:
 
 
 def wait_for(device: torch.device) -> None:
-    """Until the device has done all it was given."""
+    """Waits until the device has finished its queued work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

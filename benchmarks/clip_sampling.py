@@ -1,8 +1,8 @@
-"""Clips per second of every way to store frames: a table, and docs/results/clip_sampling.json.
+"""Clips per second of every storage format: a table, and docs/results/clip_sampling.json.
 
-All ways serve batches of 128 clips of 4 frames, 5 rows apart, from the same TwoRoom frames in warm files, in turns
-within one run, so that a busy machine slows all of them. Times are the least of the repeats. "x ours" compares what
-samples with our sampling of raw frames, and what is handed numbers of rows ("by index") with our reading of clips.
+All formats serve batches of 128 clips of 4 frames, 5 rows apart, from the same TwoRoom frames in the page cache. They alternate
+within one run, so that other load slows all of them; each time is the least of the repeats. "x ours" is relative to this
+package's sampling of raw frames, or, for formats that are given row numbers ("by index"), to its reading of clips.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 224])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--repeats", type=int, default=12)
-    parser.add_argument("--only", nargs="*", help="beginnings of the names of the ways to measure; default: all")
+    parser.add_argument("--only", nargs="*", help="prefixes of the names of the formats; default: all")
     parser.add_argument("--out", type=Path, default=RESULT)
     arguments = parser.parse_args()
     results = []
@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def record(size: int) -> list[dict[str, np.ndarray]]:
-    """Episodes of 100 rows, cut out of TwoRoom recordings joined end to end."""
+    """Episodes of 100 rows, cut from concatenated TwoRoom recordings."""
     recorded, count = [], 0
     for episode in collect_episodes("two_room", 10_000, num_workers=0, image_size=size):
         recorded.append(episode)
@@ -75,7 +75,7 @@ def record(size: int) -> list[dict[str, np.ndarray]]:
 
 
 def prepare(folder: Path, episodes: list[dict[str, np.ndarray]], only: list[str] | None) -> dict[str, int]:
-    """Writes every format that is installed and asked for: name -> bytes on disk."""
+    """Writes every installed and requested format: name -> bytes on disk."""
     pixels = np.concatenate([episode["pixels"] for episode in episodes])  # [N, 3, H, W]
     stored: dict[str, int] = {}
     for frames in ("raw", "webp", "png"):
@@ -154,21 +154,21 @@ def ways(folder: Path, stored: dict[str, int], threads: int) -> dict[str, Draw]:
 
 
 def touch(pixels: np.ndarray) -> None:
-    """Reads a byte of every page, so that none is mapped while a batch is timed: warm files, warm mappings."""
+    """Reads a byte of every page, so that no page fault is timed."""
     pixels.reshape(-1)[::4096].max()
 
 
 def slices(rows: TensorDict, span: int) -> Draw:
-    """Stock sampling of contiguous rows; the frames in between are dropped afterwards."""
+    """Samples contiguous rows with SliceSampler; the frames in between are dropped afterwards."""
     sampler = SliceSampler(slice_len=span, traj_key="episode", cache_values=True)
     buffer = TensorDictReplayBuffer(storage=TensorStorage(rows), sampler=sampler, batch_size=CLIPS * span)
     return lambda first: buffer.sample().reshape(CLIPS, span)[:, ::SKIP]
 
 
 def hdf5(path: Path) -> Draw:
-    """One read per frame: h5py takes over a hundred times as long for a strided slice.
+    """One read per frame: a strided slice takes h5py over a hundred times as long.
 
-    The cache holds four chunks of 100 frames, a small part of the file, as any cache does of a real data set.
+    The cache holds four chunks of 100 frames, a small part of the file, as with a dataset of real size.
     """
     import h5py
 
@@ -191,7 +191,7 @@ def lance_table(path: Path, threads: int) -> Draw:
 
 
 def measure(ways: dict[str, Draw], repeats: int, threads: int) -> dict[str, list[float]]:
-    """Seconds of every repeat, the ways taking turns on batches of the same kind."""
+    """Seconds of every repeat; the formats alternate."""
     torch.set_num_threads(threads)
     random = np.random.default_rng(0)
     seconds: dict[str, list[float]] = {name: [] for name in ways}
@@ -200,7 +200,7 @@ def measure(ways: dict[str, Draw], repeats: int, threads: int) -> dict[str, list
             if name in SLOW and not -1 <= repeat < 4:
                 continue
             first = random.integers(0, 20, CLIPS) * LENGTH + random.integers(0, LENGTH - SPAN + 1, CLIPS)
-            time.sleep(0.1)  # threads of the one before go on for a while: OpenMP's spin, Lance's read ahead
+            time.sleep(0.1)  # threads of the previous format stay active: OpenMP's spin, Lance's read ahead
             begin = time.perf_counter()
             batch = draw(first)
             elapsed = time.perf_counter() - begin
@@ -211,7 +211,7 @@ def measure(ways: dict[str, Draw], repeats: int, threads: int) -> dict[str, list
 
 
 def summarise(table: dict[str, list[float]], stored: dict[str, int], num_episodes: int) -> dict[str, dict[str, float]]:
-    """Least and median time, clips per second, how much slower than ours, and bytes on disk per frame."""
+    """Minimum and median time, clips per second, time relative to this package, and bytes on disk per frame."""
     sizes = {"TensorStorage": "tensordict", "SliceSampler": "tensordict"}
     result = {}
     for name, seconds in table.items():
@@ -243,12 +243,12 @@ def clip_rows(first: np.ndarray) -> np.ndarray:
 
 
 def clip_numbers(first: np.ndarray) -> np.ndarray:
-    """Numbers of the clips that begin at these rows, every episode being as long as the others."""
+    """Numbers of the clips that begin at these rows; all episodes have the same length."""
     return first // LENGTH * (LENGTH - SPAN + 1) + first % LENGTH
 
 
 def wanted(name: str, only: list[str] | None) -> bool:
-    """Whether a way was asked for; ours is always there to compare with."""
+    """Whether a format was requested; raw frames always are, for comparison."""
     return name == "raw" or not only or any(name.startswith(start) for start in only)
 
 

@@ -1,4 +1,4 @@
-"""The report of ficreg_gpu.py, ficreg_gpu.json: whole at any moment, whatever ends the slot that writes it."""
+"""The report of ficreg_gpu.py, ficreg_gpu.json, written atomically."""
 
 from __future__ import annotations
 
@@ -12,18 +12,12 @@ Runs = dict[tuple[str, str], Path]  # environment and method -> folder of the ru
 Results = dict[tuple[str, str], dict[str, Any]]
 
 
-def planned(result: dict) -> tuple[str, dict]:
-    """The method of a ``results.json`` and what its planner reached; earlier ones are keyed by the method's name."""
-    method = result.get("method") or next(key for key in result if key in ("ficreg", "lewm", "joint_inverse", "pldm"))
-    return method, result["policy"] if "policy" in result else result[method]
-
-
 def write_report(out: Path, runs: Runs, facts: dict[str, Any]) -> None:
-    """Writes what there is so far.
+    """Writes the report of the finished runs.
 
     Args:
         out: folder of the report.
-        runs: finished or not.
+        runs: all runs, finished or not.
         facts: further entries of ``ficreg_gpu.json``.
 
     Raises:
@@ -32,7 +26,7 @@ def write_report(out: Path, runs: Runs, facts: dict[str, Any]) -> None:
     results = read_results(runs)
     pairs: dict[str, str] = {}
     for (env, _), result in results.items():
-        drawn = planned(result)[1]["pairs_hash"]
+        drawn = result["policy"]["pairs_hash"]
         if pairs.setdefault(env, drawn) != drawn:
             raise ValueError(f"the runs of {env} were evaluated on different pairs: remove one of {sorted(runs.values())}.")
     content = {
@@ -45,14 +39,14 @@ def write_report(out: Path, runs: Runs, facts: dict[str, Any]) -> None:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Writes a file so that a kill leaves the old one or the new one, never a half."""
+    """Writes a file atomically: after a kill it holds the old text or the new one."""
     temporary = path.with_name(f"{path.name}.tmp")
     temporary.write_text(text)
     os.replace(temporary, path)
 
 
 def read_results(runs: Runs) -> Results:
-    """Of the runs that are finished."""
+    """Results of the finished runs."""
     return {key: json.loads((path / "results.json").read_text()) for key, path in runs.items() if finished(path)}
 
 
@@ -62,13 +56,13 @@ def finished(run_dir: Path) -> bool:
 
 
 def last_step(run_dir: Path) -> int:
-    """The last optimisation step in a run's table, 0 where there is none."""
+    """The last step in a run's metrics.csv, 0 without one."""
     rows = read_metrics(run_dir)
     return int(rows[-1]["step"]) if rows else 0
 
 
 def read_metrics(run_dir: Path) -> list[dict[str, str]]:
-    """Rows of a run's metrics.csv, but for a last one that is being written."""
+    """Complete rows of a run's metrics.csv."""
     path = run_dir / "metrics.csv"
     if not path.exists():
         return []

@@ -1,4 +1,4 @@
-"""What the pusher records, in numbers beside the official data and as a film: docs/results/push_t_*.{json,gif}."""
+"""Statistics of the PushT expert's episodes beside those of the official data: docs/results/push_t_{data.json,expert.gif}."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_ficreg.envs.push_t import render, sample_state
+from torchrl_ficreg.envs._angles import wrap_angle
+from torchrl_ficreg.envs.push_t import render_pixels, sample_state
 from torchrl_ficreg.envs.push_t.expert import PushTExpert
-from torchrl_ficreg.envs.push_t.geometry import difference, overshoot, to_block
-from torchrl_ficreg.envs.push_t.physics import AGENT_RADIUS, part_distances, PushTWorld, WINDOW
+from torchrl_ficreg.envs.push_t.geometry import AGENT_RADIUS, overshoot, part_distances, to_block, WINDOW
+from torchrl_ficreg.envs.push_t.physics import PushTWorld
 from torchrl_ficreg.envs.push_t.tasks import is_success
 
-RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
+RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
 SEED, EPISODES, STEPS = 0, 300, 150
 OFFSET, BUDGET, PAIRS = 25, 50, 400
-FILMED, COLUMNS, SIZE, SKIP = 6, 3, 128, 2  # episodes of the GIF, in a row, px, steps per frame
+FILMED, COLUMNS, SIZE, SKIP = 6, 3, 128, 2  # of the GIF: episodes, episodes in a row, px, steps per frame
 
-# Published figures of the data of arXiv 2603.19312; None where nobody has stated one.
+# Published statistics of the data of arXiv 2603.19312.
 OFFICIAL = {
     "action_mean": [-0.0087, 0.0068],
     "action_std": [0.2019, 0.2002],
@@ -33,7 +34,7 @@ OFFICIAL = {
 
 
 def main() -> None:
-    """Measures and films seeded episodes."""
+    """Measures seeded episodes and draws the GIF."""
     episodes = [record(SEED, index) for index in range(EPISODES)]
     aimed = [record(SEED, index, goal_share=1.0, random_share=0.0, free_share=0.0) for index in range(100)]
     report = {
@@ -56,7 +57,12 @@ def main() -> None:
 
 
 def record(seed: int, index: int, **options: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """States [T + 1, 7], actions [T, 2], the pusher's targets [T, 3] (the goal's pose in row 0 if aimed), CPU s per call."""
+    """One episode of the expert.
+
+    Returns:
+        States [T + 1, 7], actions [T, 2], the expert's targets [T, 3] (row 0 is the goal's pose if ``goal_share=1``), and CPU
+        seconds per call.
+    """
     task, noise = (np.random.default_rng(part) for part in np.random.SeedSequence((seed, index)).spawn(2))
     world, state, goal = PushTWorld(), sample_state(task), sample_state(task)
     expert = PushTExpert(rng=noise, **options)
@@ -73,7 +79,7 @@ def record(seed: int, index: int, **options: float) -> tuple[np.ndarray, np.ndar
 
 
 def of_actions(episodes: list[tuple]) -> dict:
-    """Moments of the actions, and how well they tell where the disc goes."""
+    """Mean, std and range of the actions, and their correlation with the agent's displacement."""
     actions = np.concatenate([episode[1] for episode in episodes])
     moves = np.concatenate([np.diff(episode[0][:, :2], axis=0) for episode in episodes])
     return {
@@ -94,10 +100,10 @@ def windows(episodes: list[tuple]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def of_windows(episodes: list[tuple]) -> dict:
-    """What happens within OFFSET steps."""
+    """Statistics of windows of OFFSET steps."""
     starts, ends = windows(episodes)
     block = np.linalg.norm(ends[:, 2:4] - starts[:, 2:4], axis=1)
-    turn = np.degrees(difference(ends[:, 4], starts[:, 4]))
+    turn = np.degrees(wrap_angle(ends[:, 4] - starts[:, 4]))
     agent = np.linalg.norm(ends[:, :2] - starts[:, :2], axis=1)
     solved = [is_success(start, end) for start, end in zip(starts, ends)]
     return {
@@ -116,7 +122,7 @@ def of_windows(episodes: list[tuple]) -> dict:
 
 
 def of_states(episodes: list[tuple]) -> dict:
-    """Contact and coverage; cells are 50 px, 50 px and 30 degrees over the range of the block's draws."""
+    """Contact and coverage; cells are 50 px, 50 px and 30 degrees over the range of the block's start poses."""
     states = np.concatenate([episode[0] for episode in episodes])
     local = np.stack([to_block(state[2:5], state[:2]) for state in states])
     gap = np.minimum(*part_distances(local[:, 0], local[:, 1])) - AGENT_RADIUS
@@ -151,10 +157,10 @@ def random_success(episodes: list[tuple]) -> float:
     rng = np.random.default_rng(SEED)
     starts, ends = windows(episodes)
     picks = rng.choice(len(starts), PAIRS, replace=False)
-    return float(np.mean([wiggles_to(starts[pick], ends[pick], rng) for pick in picks]))
+    return float(np.mean([random_actions_reach(starts[pick], ends[pick], rng) for pick in picks]))
 
 
-def wiggles_to(state: np.ndarray, goal: np.ndarray, rng: np.random.Generator) -> bool:
+def random_actions_reach(state: np.ndarray, goal: np.ndarray, rng: np.random.Generator) -> bool:
     """Whether one run of random actions reaches the goal."""
     world = PushTWorld()
     world.set_state(state)
@@ -175,7 +181,7 @@ def own_targets_reached(episodes: list[tuple]) -> float:
 
 
 def block_arrives(states: np.ndarray, actions: np.ndarray, targets: np.ndarray, seconds: float) -> bool:
-    """Whether the block comes to the first target within the episode."""
+    """Whether the block reaches the first target within the episode."""
     return any(is_there(state, targets[0]) for state in states)
 
 
@@ -185,22 +191,22 @@ def is_there(state: np.ndarray, pose: np.ndarray) -> bool:
 
 
 def rounded(value: object) -> object:
-    """Four digits after the point, in lists and dictionaries too."""
+    """Rounds numbers to four decimals, also inside lists and dictionaries."""
     if isinstance(value, dict):
         return {key: rounded(entry) for key, entry in value.items()}
     return [round(entry, 4) for entry in value] if isinstance(value, list) else round(value, 4)
 
 
 def film(episodes: list[tuple], target: Path) -> None:
-    """Episodes side by side; the pusher's current target is the pale red T."""
+    """Draws episodes side by side; the pale red T is the expert's current target."""
     import imageio.v3 as imageio
 
     tiles = []
     for states, _, targets, _ in episodes:
-        pictures = render(states[:-1:SKIP], size=SIZE, draw_goal=False)
+        pictures = render_pixels(states[:-1:SKIP], size=SIZE, draw_goal=False)
         ghosts = np.zeros((len(targets[::SKIP]), 7))
         ghosts[:, :2], ghosts[:, 2:5] = -100.0, targets[::SKIP]
-        shade = 255 - render(ghosts, size=SIZE, draw_goal=False).min(axis=1)  # [T, H, W], dark where the ghost is
+        shade = 255 - render_pixels(ghosts, size=SIZE, draw_goal=False).min(axis=1)  # [T, H, W], dark where the ghost is
         bare = pictures.min(axis=1) > 250
         weight = 0.5 * (bare & (shade > 40))
         tint = np.array([255, 120, 110])[:, None, None]

@@ -1,4 +1,4 @@
-"""Both halves of check_published_data.sh: each runs in an environment of its own, so imports stand in the functions."""
+"""The two commands of check_published_data.sh. They run in different environments, so imports are inside the functions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FRAME_TOLERANCE = {"hdf5": 0.0, "lance": 1.0}  # mean over pixels; Lance keeps J
 
 
 def collect(folder: Path) -> None:
-    """Records with stable-worldmodel: a few random episodes, as plain arrays and in both of its formats."""
+    """Records a few random episodes with stable-worldmodel, as plain arrays and in both of its formats."""
     if "torchvision" not in sys.modules:
         stand_in = types.ModuleType("torchvision")
         stand_in.tv_tensors = types.ModuleType("torchvision.tv_tensors")
@@ -26,7 +26,7 @@ def collect(folder: Path) -> None:
     from stable_worldmodel.data.format import get_format
 
     class Keep:
-        """A writer that keeps what it is given."""
+        """A writer that stores the episodes in memory."""
 
         def __enter__(self):
             self.episodes = []
@@ -90,7 +90,7 @@ def compare(folder: Path) -> None:
 
 
 def replay(name: str, rows: dict[str, np.ndarray], ends: np.ndarray) -> None:
-    """Says how far one step of our environment ends from the next recorded state."""
+    """Prints the distance of one step of our environment from the next recorded state."""
     from torchrl_ficreg.envs.registry import find_entry
 
     env = find_entry(name).load_env()(image_size=SIZE, **OUR_ENV[name])
@@ -100,7 +100,7 @@ def replay(name: str, rows: dict[str, np.ndarray], ends: np.ndarray) -> None:
         try:
             env.reset(options={"state": state, "goal_state": state})
         except ValueError:
-            continue  # a reset in the border, which the published environment allows
+            continue  # the published environment allows starts in the border
         observation = env.step(rows["action"][row])[0]
         away.append(abs(observation["state"] - rows["state"][row + 1]).max())
     env.close()

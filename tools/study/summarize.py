@@ -7,11 +7,9 @@ import json
 import sys
 from pathlib import Path
 
-from ficreg_gpu_report import planned
-
 from torchrl_ficreg.evaluation import wilson_interval
 
-RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
+RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
 KEPT = (
     "success_rate",
     "success_interval",
@@ -27,7 +25,7 @@ def main(name: str, pattern: str) -> None:
     runs, pooled, hashes = {}, {}, set()
     for file in sorted(glob.glob(pattern)):
         result = json.loads(Path(file).read_text())
-        method, outcome = planned(result)
+        method, outcome = result["method"], result["policy"]
         hashes.add(outcome["pairs_hash"])
         runs[Path(file).parent.name] = {key: outcome[key] for key in KEPT} | {
             "random": result["random"]["success_rate"],

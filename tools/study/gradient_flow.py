@@ -1,4 +1,4 @@
-"""Measures who receives gradient from which term of every loss: docs/results/gradient_flow.{json,png} and a table."""
+"""Gradient norm of every term of every loss at every network: docs/results/gradient_flow.{json,png} and a table of the docs."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tensordict import TensorDict
 from torchrl_ficreg import FICRegLoss, gradient_flow, InverseDynamicsModel, LeWMLoss, make_world_model, ModelConfig
 from torchrl_ficreg.objectives import JointInverseLoss, PLDMLoss
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 NETWORKS = ("encoder", "predictor", "inverse_model")
-HISTORY, BLOCK = 3, 10  # latents the predictor sees; width of an action block
+HISTORY, BLOCK = 3, 10  # latents that the predictor takes; width of an action block
 
 # title: class, kind of inverse model, arguments
 LOSSES = {
@@ -25,8 +25,8 @@ LOSSES = {
     'FICRegLoss, consistency="nll"': (FICRegLoss, "gaussian", {"consistency": "nll"}),
     'FICRegLoss, consistency_target="judge"': (FICRegLoss, "mlp", {"consistency_target": "judge"}),
     "FICRegLoss, consistency_steps=2": (FICRegLoss, "mlp", {"consistency_steps": 2}),
-    "FICRegLoss, ensemble of judges": (FICRegLoss, "ensemble", {}),
-    "FICRegLoss, transformer as judge": (FICRegLoss, "transformer", {}),
+    "FICRegLoss, ensemble": (FICRegLoss, "ensemble", {}),
+    "FICRegLoss, transformer": (FICRegLoss, "transformer", {}),
     "JointInverseLoss": (JointInverseLoss, "mlp", {}),
     "JointInverseLoss, sigreg_coeff=0": (JointInverseLoss, "mlp", {"sigreg_coeff": 0.0}),
     "PLDMLoss": (PLDMLoss, "mlp", {"time_cov_coeff": 1.0, "idm_coeff": 1.0}),
@@ -35,7 +35,7 @@ LOSSES = {
 
 def main() -> None:
     """Measures every loss on one random clip batch."""
-    torch.set_num_threads(1)  # the same digits on every machine with the same kernels
+    torch.set_num_threads(1)  # reproducible digits
     tables = {title: measure(*entry) for title, entry in LOSSES.items()}
     (DOCS / "results").mkdir(parents=True, exist_ok=True)
     (DOCS / "results" / "gradient_flow.json").write_text(json.dumps(tables, indent=2) + "\n")
@@ -44,11 +44,11 @@ def main() -> None:
 
 
 def measure(make: type, kind: str | None, arguments: dict) -> dict[str, dict[str, float]]:
-    """``{term: {network: norm}}`` of a loss around new networks, always the same ones."""
+    """``{term: {network: norm}}`` of a loss on new networks with the same seed for each loss."""
     torch.manual_seed(0)
     config = ModelConfig.preset("cpu", history=HISTORY)
     model, _ = make_world_model(config, action_dim=2)
-    for block in model.predictor.module.blocks:  # away from AdaLN-zero, whose first step passes nothing on
+    for block in model.predictor.module.blocks:  # AdaLN-zero passes no gradient to the actions at initialization
         torch.nn.init.normal_(block.to_modulation.weight, std=0.1)
     pixels = torch.randint(0, 256, (32, HISTORY + 1, 3, 64, 64), dtype=torch.uint8)
     action = torch.randn(32, HISTORY + 1, BLOCK)
@@ -56,7 +56,7 @@ def measure(make: type, kind: str | None, arguments: dict) -> dict[str, dict[str
     if kind is not None:
         history = {"history": HISTORY} if kind == "transformer" else {}
         networks.append(InverseDynamicsModel(config.latent_dim, BLOCK, config.inverse_hidden_dim, kind=kind, **history))
-    torch.manual_seed(1)  # the same dropout, however many numbers the inverse model took
+    torch.manual_seed(1)  # the same dropout for every kind of inverse model
     clip = TensorDict({"pixels": pixels, "action": action}, action.shape[:2])
     return gradient_flow(make(*networks, **arguments), clip)
 
@@ -64,7 +64,7 @@ def measure(make: type, kind: str | None, arguments: dict) -> dict[str, dict[str
 def tabulate(tables: dict[str, dict[str, dict[str, float]]]) -> str:
     """The tables as one list-table of reStructuredText; exact zeros are 0."""
     lines = [
-        ".. Written by sota-check/gradient_flow.py.",
+        ".. Written by tools/study/gradient_flow.py.",
         "",
         ".. list-table:: Gradient norm of every term at every network; 0 is exact",
         "   :header-rows: 1",
@@ -81,12 +81,12 @@ def tabulate(tables: dict[str, dict[str, dict[str, float]]]) -> str:
 
 
 def number_of(norm: float) -> str:
-    """Two digits, or 0 where nothing arrives."""
+    """Two digits, or 0 for an exact zero."""
     return "0" if norm == 0 else f"{norm:.2g}"
 
 
 def draw(tables: dict[str, dict[str, dict[str, float]]], target: Path) -> None:
-    """One picture per loss; zeros are on white, norms shaded by their logarithm."""
+    """One panel per loss; zeros are white, norms are shaded by their logarithm."""
     matplotlib.use("Agg")
     from matplotlib import pyplot
 

@@ -1,10 +1,10 @@
-"""Seconds per training step, ours beside the plain formulation: docs/results/training_speed_*.json.
+"""Seconds per training step, of this package and of plain formulations: docs/results/training_speed_*.json.
 
-All ways train the same weights on the same clips: 8 of 4 frames at 224 pixels for the paper's model, 128 at 64 pixels for
-the small ones. Each lives in a process of its own, with the allocator's settings its users have, and they take turns
-within one run, so that a busy machine slows all of them; times are the least of the repeats in all rounds, each round
-with new processes, for memory lies differently in each. "Textbook" computes attention by its formula, "fused" by torch's
-``scaled_dot_product_attention``; the rest of the four plain ways is the same.
+All of them train the same weights on the same clips: 8 of 4 frames at 224 pixels for the paper's model, 128 at 64 pixels for
+the small ones. Each has its own process, with the allocator settings that its users have. They alternate within one run, so
+that other load slows all of them; each time is the least of all repeats in all rounds, and each round starts new processes,
+because the memory layout differs between processes. "Textbook" computes attention by its formula, "fused" by
+``scaled_dot_product_attention``; otherwise the four plain formulations are equal.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import torch
-from plain_formulation import fused, matrix_rate, Mix, parts, plain_encoder, plain_precisions, plain_terms, textbook
+from baselines import fused, matrix_rate, Mix, parts, plain_encoder, plain_precisions, plain_terms, textbook
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
@@ -55,8 +55,8 @@ def main() -> None:
     parser.add_argument("--clips", type=int, help="default: 8, of the small models 128")
     parser.add_argument("--repeats", type=int, default=6, help="steps in each round")
     parser.add_argument("--rounds", type=int, default=3, help="of new processes")
-    parser.add_argument("--quick", action="store_true", help="two clips, one repeat, to see it run; writes no default file")
-    parser.add_argument("--profile", action="store_true", help="only print where the time of our step goes")
+    parser.add_argument("--quick", action="store_true", help="two clips, one repeat, to check that it runs; writes no file by default")
+    parser.add_argument("--profile", action="store_true", help="only print a profile of this package's step")
     parser.add_argument("--out", type=Path, help=f"default: {RESULT}")
     arguments = parser.parse_args()
     repeats, rounds = (1, 1) if arguments.quick else (arguments.repeats, arguments.rounds)
@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def measure_model(model: str, clips: int, repeats: int, rounds: int) -> dict:
-    """All ways of one model, printed and returned."""
+    """Measures all formulations of one model; prints and returns the results."""
     plain = [name for name, (_, precision) in PLAIN.items() if precision in plain_precisions()]
     losses, seconds, cpu_seconds, encoding = measure(("ours", *plain), model, clips, repeats, rounds)
     results = {
@@ -101,7 +101,7 @@ def measure_model(model: str, clips: int, repeats: int, rounds: int) -> dict:
 
 
 class Way:
-    """One way to train: its own copy of the weights, its own optimiser."""
+    """One formulation, with its own weights and optimizer."""
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class Way:
         self.loss, self.clip, self.objective, self.precision = start, clip, objective, precision
         self.encode = encode
         self.params = [param for param in self.loss.parameters() if param.requires_grad]
-        kind = {"fused": True} if fused else {}  # torch's own choice, as one writes it first
+        kind = {"fused": True} if fused else {}  # torch's default for plain formulations
         self.optimizer = torch.optim.AdamW(self.params, lr=5e-5, weight_decay=1e-3, **kind)
 
     def terms(self) -> Terms:
@@ -156,7 +156,7 @@ class Way:
 
 
 def make_way(name: str, model: str, clips: int) -> Way:
-    """The way of that name, from the starting point they share."""
+    """The formulation of that name, with the common initial weights."""
     start, clip = starting_point(MODELS[model]), random_clips(MODELS[model], clips)
     if name == "ours":
         keep_freed_memory(KEPT)
@@ -166,7 +166,7 @@ def make_way(name: str, model: str, clips: int) -> Way:
 
 
 def starting_point(config: ModelConfig) -> FICRegLoss:
-    """The loss with all its weights. The action modulation is moved off its start at zero, as training does."""
+    """The loss with all its weights; the action modulation is not zero, as after training."""
     torch.manual_seed(0)
     model, inverse_model = make_world_model(config, ACTIONS)
     with torch.no_grad():
@@ -185,7 +185,7 @@ def random_clips(config: ModelConfig, clips: int) -> TensorDict:
 
 
 def our_terms(loss: FICRegLoss, clip: TensorDictBase) -> Terms:
-    """The package's own."""
+    """The terms of this package's loss."""
     return dict(loss(clip).items())
 
 
@@ -195,17 +195,17 @@ def our_latents(loss: FICRegLoss, pixels: torch.Tensor) -> torch.Tensor:
 
 
 def plain_latents(loss: FICRegLoss, pixels: torch.Tensor, mix: Mix) -> torch.Tensor:
-    """As :func:`our_latents`, plain."""
+    """As :func:`our_latents`, by the plain formulation."""
     return plain_encoder(parts(loss, "encoder"), pixels, mix)
 
 
 def measure(names: tuple[str, ...], model: str, clips: int, repeats: int, rounds: int) -> tuple[dict, dict, dict, dict]:
-    """Of each way: its losses, the least wall and processor seconds of a step, and the least seconds of encoding."""
+    """For each formulation: losses, least wall and processor seconds of a step, and least seconds of encoding."""
     losses, wall, cpu, encoding = {}, *(dict.fromkeys(names, math.inf) for _ in range(3))
     for _ in range(rounds):
         with ways(names, model, clips) as pipes:
-            losses = losses or {name: ask(pipe, "compare") for name, pipe in pipes.items()}  # the same in every round
-            for repeat in range(-3, repeats):  # kernels choose their blocking at first, then allocators settle
+            losses = losses or {name: ask(pipe, "compare") for name, pipe in pipes.items()}  # equal in every round
+            for repeat in range(-3, repeats):  # warm-up of kernels and allocators
                 for name, pipe in pipes.items():
                     spent, busy = ask(pipe, "step")
                     alone, _ = ask(pipe, "encoding")
@@ -217,7 +217,7 @@ def measure(names: tuple[str, ...], model: str, clips: int, repeats: int, rounds
 
 @contextmanager
 def ways(names: tuple[str, ...], model: str, clips: int) -> Iterator[dict[str, Connection]]:
-    """A process for each way, and the pipe that leads to it."""
+    """A process for each formulation, and the pipe to it."""
     context, pipes, workers = multiprocessing.get_context("spawn"), {}, []
     for name in names:
         pipes[name], other = context.Pipe()
@@ -232,25 +232,25 @@ def ways(names: tuple[str, ...], model: str, clips: int) -> Iterator[dict[str, C
 
 
 def serve(pipe: Connection, name: str, model: str, clips: int) -> None:
-    """Calls the methods of one way, by name, until asked for None."""
+    """Calls methods of one formulation by name, until it receives None."""
     way = make_way(name, model, clips)
     for method in iter(pipe.recv, None):
         pipe.send(getattr(way, method)())
 
 
 def ask(pipe: Connection, method: str) -> dict[str, float] | tuple[float, float]:
-    """What a method of the way at the other end returns."""
+    """Calls a method in the process at the other end."""
     pipe.send(method)
     return pipe.recv()
 
 
 def ratios(seconds: dict[str, float]) -> dict[str, float]:
-    """How many times faster ours is than each other way."""
+    """Speed-up of this package over each other formulation."""
     return {name: spent / seconds["ours"] for name, spent in seconds.items() if name != "ours"}
 
 
 def differences(losses: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Of each loss and the gradient norm, relative to those of the plain formulation in fp32."""
+    """Relative difference of each loss and of the gradient norm from textbook fp32."""
     exact = losses["textbook fp32"]
     return {
         name: {key: abs(value - exact[key]) / abs(exact[key]) for key, value in terms.items()}
@@ -260,7 +260,7 @@ def differences(losses: dict[str, dict[str, float]]) -> dict[str, dict[str, floa
 
 
 def floor(way: Way) -> dict[str, float]:
-    """Operations of the matrix products of a step, and the seconds they need at the rate of one large product."""
+    """Operations of the matrix products of a step, and their time at the rate of one large product."""
     with FlopCounterMode(display=False) as counter:
         sum(way.terms().values()).backward()
     way.optimizer.zero_grad()
@@ -291,7 +291,7 @@ def report(model: str, results: dict) -> None:
 
 
 def profile(way: Way) -> None:
-    """Where the time of one step goes, by kernel."""
+    """Prints the time of one step by kernel."""
     with torch.profiler.profile(record_shapes=True) as trace:
         way.step()
     print(trace.key_averages(group_by_input_shape=True).table(sort_by="self_cpu_time_total", row_limit=45))

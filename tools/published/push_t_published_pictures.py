@@ -1,12 +1,12 @@
-"""Does a model trained on our pictures of PushT plan on the published ones?
+"""Success rate of a model trained on this package's PushT images, planning on the published ones.
 
-Steps: set up the published environment as ``make_golden_push_t.py`` says, train, then::
+Steps: set up the published environment as ``test/envs/push_t/golden/make_push_t.py`` says, train, then::
 
-    python sota-check/push_t_published_pictures.py runs/push_t_cpu_ficreg_seed0 PUBLISHED_PYTHON [PAIRS]
+    python tools/published/push_t_published_pictures.py runs/push_t_cpu_ficreg_seed0 PUBLISHED_PYTHON [PAIRS]
 
-where PUBLISHED_PYTHON is the interpreter of that environment. Plans on the run's own start-goal pairs, once seeing our
-pictures and once the published ones, drawn at 224 pixels and scaled down; writes ``published_pictures.json`` beside
-the run's results.
+where PUBLISHED_PYTHON is the interpreter of that environment. Plans on the run's own start-goal pairs, once on this
+package's images and once on the published ones, rendered at 224 pixels and scaled down; writes ``published_pictures.json``
+beside the run's results.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import torch
 
-from torchrl_ficreg import LatentCEMPlanner, MPCPolicy, PlanConfig
+from torchrl_ficreg import CEMConfig, LatentCEMPlanner, MPCPolicy
 from torchrl_ficreg.envs.push_t.env import PushTEnv
 from torchrl_ficreg.evaluation import evaluate_mpc, StartGoalPairs
 from torchrl_ficreg.trainers import load_world_model
 
-DRAWER = Path(__file__).with_name("make_golden_push_t.py")
+DRAWER = Path(__file__).resolve().parents[2] / "test" / "envs" / "push_t" / "golden" / "make_push_t.py"
 SIZE = 224
 
 
 class PublishedPictures(PushTEnv):
-    """PushT as it moves here and looks there."""
+    """PushT with this package's physics and the published images."""
 
     server: subprocess.Popen
 
@@ -58,8 +58,9 @@ def main() -> None:
         start_state=pairs.start_state[rows],
         goal_state=pairs.goal_state[rows],
     )
-    plan = {key: value for key, value in card.config["plan"].items() if key != "search"}
-    planner = LatentCEMPlanner(model, PlanConfig(**plan), action_bounds=(card.action_low, card.action_high))
+    known = {field.name for field in fields(CEMConfig)}
+    plan = {key: value for key, value in card.config["plan"].items() if key in known}
+    planner = LatentCEMPlanner(model, CEMConfig(**plan), action_bounds=(card.action_low, card.action_high))
     gymnasium.register("PublishedPictures-v0", PublishedPictures)
     results = {"pairs": count}
     with subprocess.Popen([python, str(DRAWER), "serve"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as server:

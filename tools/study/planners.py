@@ -1,8 +1,8 @@
-"""Success against planning time for every search, on trained runs: docs/results/planners.json and planners.png.
+"""Success rate against planning time of every planner, on trained runs: docs/results/planners.{json,png}.
 
-    python sota-check/planners.py runs/two_room_cpu_ficreg_seed0 runs/push_t_cpu_ficreg_seed0
+    python tools/study/planners.py runs/two_room_cpu_ficreg_seed0 runs/push_t_cpu_ficreg_seed0
 
-Each search runs through evaluate.py on the run's own frozen pairs; the policy is trained first where it is missing.
+Each planner is evaluated by evaluate.py on the run's own frozen pairs. The goal-conditioned policy is trained first if missing.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = ROOT / "sota-implementations" / "ficreg"
 FRAME_SKIP = 5  # environment steps in an action block
 SEARCHES = {
@@ -26,8 +26,8 @@ SEARCHES = {
     "shooting 300 x 10": ["plan=shooting"],
     "policy": ["plan=policy"],
     "iCEM 100 x 5 + policy": ["plan=icem", "plan.iterations=5", "plan.policy=auto"],
-    "judged CEM 300 x 10": ["plan=cem", "plan.consistency=0.1"],
-    "replanned CEM 300 x 10": ["plan=cem", "plan.receding_horizon=1"],
+    "CEM 300 x 10, consistency cost": ["plan=cem", "plan.consistency=0.1"],
+    "CEM 300 x 10, receding horizon 1": ["plan=cem", "plan.receding_horizon=1"],
 }
 
 
@@ -35,7 +35,7 @@ def main() -> None:
     """Evaluates, collects, draws."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+")
-    parser.add_argument("--only", nargs="*", help="beginnings of the names of the searches; default: all")
+    parser.add_argument("--only", nargs="*", help="prefixes of the names of the planners; default: all")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "planners.json")
     parser.add_argument("--override", nargs="*", default=[], help="further settings of evaluate.py")
     arguments = parser.parse_args()
@@ -74,7 +74,7 @@ def evaluate(run: Path, overrides: list[str]) -> dict:
 
 
 def call(script: str, *overrides: str) -> None:
-    """Runs a script of the recipe; its own output is shown when it fails."""
+    """Runs a script of the recipe; raises with its output when it fails."""
     done = subprocess.run([sys.executable, str(SCRIPTS / script), *overrides], capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{script} {' '.join(overrides)} failed:\n{done.stderr[-2000:]}")

@@ -1,8 +1,8 @@
-"""Trains and evaluates LeWM and FICReg on TwoRoom and PushT within a slot of time; run_ficreg_gpu.sh calls it.
+"""Trains and evaluates LeWM and FICReg on TwoRoom and PushT within a time slot; called by run_ficreg_gpu.sh.
 
-Each run is train.py in a process of its own, which records episodes, trains, plans on frozen pairs and can be stopped
-at any moment. When time is up the one at work is stopped; the same command continues with it in the next slot. The
-report is brought up to date every minute and after every run, so that a slot which is cut short leaves one.
+Each run is a process of train.py, which records episodes, trains, plans on frozen pairs and can be stopped at any time. At the end
+of the slot the current run is stopped; the same command continues it in the next slot. The report is updated every minute and
+after every run, so that a killed slot leaves one.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from typing import Any
 
 from ficreg_gpu_report import finished, Runs, write_report, write_whole
 
-ROOT = Path(__file__).resolve().parents[1]
-TRAIN = ROOT / "sota-check" / "train_bare.py"
+ROOT = Path(__file__).resolve().parents[2]
+TRAIN = ROOT / "sota-implementations" / "ficreg" / "train.py"
 ENVIRONMENTS, METHODS = ("two_room", "push_t"), ("lewm", "ficreg")
 TIME_IS_UP = 75  # exit code; EX_TEMPFAIL of sysexits.h
-REPORT_SECONDS = 60.0  # of a slot, kept for the profile and the pictures
-PATIENCE = 45.0  # seconds that a stopped run may take to write its checkpoint
-REFRESH = 60.0  # seconds from one report to the next
+REPORT_SECONDS = 60.0  # of a slot, reserved for the profile and the figures
+STOP_SECONDS = 45.0  # that a stopped run may take to write its checkpoint
+REFRESH = 60.0  # seconds between reports
 LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None  # opened before any fork
 PR_SET_PDEATHSIG = 1
 
@@ -59,10 +59,10 @@ TINY = [
 
 
 def main() -> int:
-    """Goes on with what is missing, then reports what is there."""
+    """Continues or starts the unfinished runs, then writes the report."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--work", type=Path, required=True, help="episodes and runs")
-    parser.add_argument("--out", type=Path, required=True, help="the report")
+    parser.add_argument("--work", type=Path, required=True, help="folder of episodes and runs")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the report")
     parser.add_argument("--minutes", type=float, help="length of the slot; 10, or an hour for --dry-run")
     parser.add_argument("--began", type=float, default=time.time(), help="when the slot began, seconds since 1970")
     parser.add_argument("--dry-run", action="store_true", help="tiny sizes, on the CPU")
@@ -84,7 +84,7 @@ def main() -> int:
     finally:
         slot.report()
     slot.draw()
-    slot.report()  # the length of the slot with its pictures
+    slot.report()  # with the time of the figures
     if slot.failed:
         print(f"error: {', '.join(slot.failed)} failed; see {arguments.out / 'log.txt'}", file=sys.stderr)
         return 1
@@ -93,19 +93,19 @@ def main() -> int:
 
 
 def end_slot(*_: object) -> None:
-    """What SIGTERM does, once: a second one must not cut the report that the first one leads to."""
+    """Handles the first SIGTERM; later ones are ignored, so that the report is written completely."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.exit(TIME_IS_UP)
 
 
 class Slot:
-    """What there is to report.
+    """State of a time slot, and its report.
 
     Args:
-        work: folder of the slots' lengths and the profile.
+        work: folder of the lengths of all slots and of the profile.
         out: folder of the report.
-        runs: finished or not.
-        began: on the monotonic clock.
+        runs: all runs, finished or not.
+        began: start of the slot on the monotonic clock, s.
     """
 
     def __init__(self, work: Path, out: Path, runs: Runs, began: float) -> None:
@@ -120,19 +120,19 @@ class Slot:
 
     @property
     def profile(self) -> dict[str, Any] | None:
-        """Of a training step, once it was measured."""
+        """Profile of a training step, None before it was measured."""
         path = self.work / "profile.json"
         return json.loads(path.read_text()) if path.exists() else None
 
     def report(self) -> None:
-        """Brings the length of this slot and the report up to date."""
+        """Updates the length of this slot and the report."""
         slots = [*self.before, round(time.monotonic() - self.began, 1)]
         write_whole(self.work / "slots.json", json.dumps(slots))
         facts = {"complete": self.complete, "failed": self.failed, "slots": slots, "profile": self.profile}
         write_report(self.out, self.runs, facts)
 
     def draw(self) -> None:
-        """Draws the report's pictures, or says that it cannot."""
+        """Draws the figures; prints a line if matplotlib is missing."""
         try:
             from ficreg_gpu_pictures import draw_pictures
         except ImportError as error:
@@ -142,7 +142,7 @@ class Slot:
 
 
 def go_on(arguments: argparse.Namespace, env: str, method: str, stop_at: float, log: Any, slot: Slot) -> bool:
-    """Starts or continues a run where it is not finished and time is left; false where it failed by itself."""
+    """Starts or continues an unfinished run if time is left; false if it failed."""
     name = f"{env}_{method}"
     left = stop_at - time.monotonic()
     if finished(slot.runs[env, method]) or left <= 0:
@@ -166,7 +166,7 @@ def go_on(arguments: argparse.Namespace, env: str, method: str, stop_at: float, 
 
 
 def die_with(parent: int) -> None:
-    """In a new process, before its program: let it get SIGTERM as soon as its parent is gone, however that ends."""
+    """Called in a new process before its program: requests SIGTERM from the kernel when the parent process ends."""
     if LIBC is not None:
         LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != parent:  # gone already
@@ -174,17 +174,17 @@ def die_with(parent: int) -> None:
 
 
 def stop(process: subprocess.Popen) -> None:
-    """Asks a process to end, which makes train.py write what it has, and ends it if it does not."""
+    """Sends SIGTERM, on which train.py writes a checkpoint, and SIGKILL after ``STOP_SECONDS``."""
     if process.poll() is None:
         process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(PATIENCE)
+            process.wait(STOP_SECONDS)
         process.kill()
         process.wait()
 
 
 def profile_once(arguments: argparse.Namespace, run_dir: Path | None) -> None:
-    """Measures the training step of a finished run, in the first slot that has one."""
+    """Profiles a training step of a finished run, unless there is a profile."""
     path = arguments.work / "profile.json"
     if run_dir is not None and not path.exists():
         from step_profile import profile  # torch, which takes seconds to import

@@ -1,8 +1,8 @@
-"""Seconds per plan of our planners beside plain loops, and where the time goes: docs/results/planning_speed_*.json.
+"""Seconds per plan of the planners of this package, plain loops and TorchRL's CEMPlanner: docs/results/planning_speed_*.json.
 
-All ways plan for the same latents with the same weights, in turns within one run, so that a busy machine slows all of
-them; times are the least of the repeats. The plain loop is what one writes first: in every iteration, for every
-environment, the whole window goes through a textbook predictor again at every imagined step.
+All of them plan for the same latents with the same weights. They alternate within one run, so that other load slows all of them;
+each time is the least of the repeats. The plain loop handles one environment at a time, and recomputes the whole window of
+a textbook predictor at every step of every rollout.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from functools import partial
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
-from plain_formulation import matrix_rate, plain_precisions
+from baselines import fused, matrix_rate, plain_precisions, plain_predictor
 from tensordict import TensorDict
 from torch.utils.flop_counter import FlopCounterMode
 from torchrl.modules.planners import CEMPlanner
 
-from torchrl_ficreg import LatentCEMPlanner, LatentGoalEnv, LatentWorldModel, make_world_model, ModelConfig, PlanConfig
+from torchrl_ficreg import CEMConfig, LatentCEMPlanner, LatentGoalEnv, LatentWorldModel, make_world_model, ModelConfig
 from torchrl_ficreg._device import autocast, describe_processor, keep_freed_memory
 
 RESULT = Path("planning_speed.json")
@@ -34,8 +33,8 @@ def main() -> None:
     """Measures, prints and writes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--iterations", type=int, default=30, help="of one environment; of 50 a tenth as many")
-    parser.add_argument("--quick", action="store_true", help="seconds instead of minutes, to see it run")
+    parser.add_argument("--iterations", type=int, default=30, help="for one environment; a tenth as many for 50")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, to check that it runs")
     parser.add_argument("--out", type=Path, default=RESULT)
     arguments = parser.parse_args()
     repeats, iterations = (1, 2) if arguments.quick else (arguments.repeats, arguments.iterations)
@@ -67,7 +66,7 @@ def main() -> None:
 
 
 def world_model(preset: str) -> LatentWorldModel:
-    """A world model whose action modulation is moved off its start at zero, as training does."""
+    """A world model whose action modulation is not zero, as after training."""
     torch.manual_seed(0)
     model, _ = make_world_model(ModelConfig.preset(preset), ACTIONS)
     with torch.no_grad():
@@ -77,8 +76,8 @@ def world_model(preset: str) -> LatentWorldModel:
 
 
 def against_plain_loop(model: LatentWorldModel, envs: int, iterations: int, repeats: int) -> dict:
-    """Seconds per plan, ours and the plain loop in fp32 and under bf16 autocast."""
-    config = PlanConfig(iterations=iterations, num_candidates=300, num_elites=30, horizon=HORIZON)
+    """Seconds per plan: this package, and the plain loop in fp32 and under bf16 autocast."""
+    config = CEMConfig(iterations=iterations, num_candidates=300, num_elites=30, horizon=HORIZON)
     ways = {"ours": LatentCEMPlanner(model, config, action_bounds=BOUNDS).plan}
     ways |= {
         f"plain {precision}": partial(plain_cem, model, iterations=iterations, precision=precision)
@@ -92,7 +91,7 @@ def against_plain_loop(model: LatentWorldModel, envs: int, iterations: int, repe
 
 
 def against_stock_planner(preset: str, envs: int, candidates: int, iterations: int, repeats: int) -> dict:
-    """Seconds per plan, ours and TorchRL's CEMPlanner on a LatentGoalEnv."""
+    """Seconds per plan: this package, and TorchRL's CEMPlanner on a LatentGoalEnv."""
     model = world_model(preset)
     settings = {"num_candidates": candidates, "num_elites": candidates // 10, "iterations": iterations}
     stock = CEMPlanner(
@@ -104,13 +103,13 @@ def against_stock_planner(preset: str, envs: int, candidates: int, iterations: i
     )
 
     def plan_stock(latent: torch.Tensor, goal: torch.Tensor) -> None:
-        keep_freed_memory(32 * 2**20, lower=True)  # what glibc comes to by itself
+        keep_freed_memory(32 * 2**20, allow_decrease=True)  # what glibc comes to by itself
         with torch.no_grad():
             stock(stock.env.reset(TensorDict({"latent": latent, "goal_latent": goal}, [len(latent)])))
 
     ways: dict[str, Way] = {"CEMPlanner": plan_stock}
     for name, precision in (("ours", "auto"), ("ours fp32", "fp32")):
-        ways[name] = LatentCEMPlanner(model, PlanConfig(**settings, precision=precision), action_bounds=BOUNDS).plan
+        ways[name] = LatentCEMPlanner(model, CEMConfig(**settings, precision=precision), action_bounds=BOUNDS).plan
     seconds = in_turns(ways, envs, model.latent_dim, repeats)
     row = {"preset": preset, "environments": envs, "candidates": candidates, "iterations": iterations}
     row |= {"seconds_per_plan": seconds}
@@ -124,7 +123,7 @@ def in_turns(ways: dict[str, Way], envs: int, latent_dim: int, repeats: int) -> 
     generator = torch.Generator().manual_seed(0)
     latent, goal = torch.randn(2, envs, latent_dim, generator=generator)
     for way in ways.values() if envs == 1 else ():
-        way(latent, goal)  # kernels choose their blocking at the first call
+        way(latent, goal)  # warm-up: kernels choose their blocking at the first call
     least = dict.fromkeys(ways, float("inf"))
     for _ in range(repeats):
         for name, way in ways.items():
@@ -137,7 +136,7 @@ def in_turns(ways: dict[str, Way], envs: int, latent_dim: int, repeats: int) -> 
 @torch.no_grad()
 def plain_cem(model: LatentWorldModel, latent: torch.Tensor, goal: torch.Tensor, iterations: int, precision: str) -> None:
     """CEM, environment by environment, 300 candidates, 30 elites."""
-    keep_freed_memory(32 * 2**20, lower=True)  # what glibc comes to by itself
+    keep_freed_memory(32 * 2**20, allow_decrease=True)  # what glibc comes to by itself
     for start, target in zip(latent, goal):
         mean, std = torch.zeros(HORIZON, model.block_dim), torch.ones(HORIZON, model.block_dim)
         for _ in range(iterations):
@@ -149,34 +148,19 @@ def plain_cem(model: LatentWorldModel, latent: torch.Tensor, goal: torch.Tensor,
 
 
 def plain_rollout(model: LatentWorldModel, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-    """[N, 1, D] and [N, S, F * A] -> [N, 1 + S, D]: the whole window again at every step."""
+    """[N, 1, D] and [N, S, F * A] -> [N, 1 + S, D]; recomputes the whole window at every step."""
     for step in range(action.shape[1]):
         first = max(0, step + 1 - model.history)
-        predicted = plain_predictor(model.predictor.module, latent[:, first:], action[:, first : step + 1])[:, -1:]
+        window = latent[:, first:], action[:, first : step + 1]
+        predicted = plain_predictor(model.predictor.module, *window, fused)[:, -1:]
         latent = torch.cat([latent, predicted], dim=1)
     return latent
 
 
-def plain_predictor(network, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-    """The predictor as a textbook writes it: [N, T, D] and [N, T, F * A] -> [N, T, D]."""
-    x = network.to_width(latent) + network.position[:, : latent.shape[1]]
-    condition = network.action_embedding(action)
-    for block in network.blocks:
-        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = block.to_modulation(F.silu(condition)).chunk(6, dim=-1)
-        h = block.attn_norm(block.adaptive_norm(x) * (1 + scale_a) + shift_a)
-        query, key, value = (
-            part.unflatten(-1, (block.attn.heads, -1)).transpose(1, 2) for part in block.attn.to_qkv(h).chunk(3, dim=-1)
-        )
-        h = F.scaled_dot_product_attention(query, key, value, is_causal=True).transpose(1, 2).flatten(2)
-        x = x + gate_a * block.attn.to_out(h)
-        x = x + gate_m * block.mlp(block.mlp_norm(block.adaptive_norm(x) * (1 + scale_m) + shift_m))
-    return network.projector(network.norm(x))
-
-
 @torch.no_grad()
 def profile(model: LatentWorldModel) -> dict:
-    """One iteration of one environment: seconds by kernel, and the floor its matrix products set."""
-    planner = LatentCEMPlanner(model, PlanConfig(iterations=10), action_bounds=BOUNDS)
+    """One iteration of one environment: seconds by kernel, and the least seconds of its matrix products."""
+    planner = LatentCEMPlanner(model, CEMConfig(iterations=10), action_bounds=BOUNDS)
     latent, goal = torch.randn(2, 1, model.latent_dim)
     planner.plan(latent, goal)
     began = time.perf_counter()
@@ -199,7 +183,7 @@ def profile(model: LatentWorldModel) -> dict:
         "times_the_floor": iteration / floor,
         "shares": shares,
     }
-    print(f"\none iteration {1e3 * iteration:.1f} ms, floor {1e3 * floor:.1f} ms")
+    print(f"\none iteration {1e3 * iteration:.1f} ms, its matrix products at least {1e3 * floor:.1f} ms")
     for name, share in shares.items():
         print(f"  {name:<34}{share:>7.1%}")
     return result

@@ -1,17 +1,16 @@
-"""Time of every loss, eager and compiled, and of SIGReg: needs pytest-benchmark."""
+"""Time of every loss, eager and compiled; `make slow` runs it. Needs pytest-benchmark."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from sigreg_cases import CASES, forward_backward, latents
 from tensordict import TensorDict
 
 from torchrl_ficreg import FICRegLoss, LeWMLoss, make_world_model, ModelConfig
 from torchrl_ficreg.objectives import JointInverseLoss, PLDMLoss
 
 pytest.importorskip("pytest_benchmark")
-pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning:tensordict.*")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::FutureWarning:tensordict.*")]
 
 LOSSES = {
     "lewm": (LeWMLoss, {}),
@@ -24,16 +23,10 @@ LOSSES = {
 SHAPES = {"cpu": (128, 2, 64), "paper": (8, 4, 224)}  # clips, frames, pixels
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_sigreg(benchmark, name):
-    module, latent = CASES[name](), latents()
-    benchmark.pedantic(forward_backward, (module, latent), rounds=7, warmup_rounds=1)
-
-
 @pytest.mark.parametrize("mode", ["eager", "compiled"])
 @pytest.mark.parametrize("preset", SHAPES)
 @pytest.mark.parametrize("name", LOSSES)
-def test_loss(benchmark, name, preset, mode):
+def test_time_of_a_loss(benchmark, name, preset, mode):
     torch.manual_seed(0)
     batch, frames, size = SHAPES[preset]
     model, inverse_model = make_world_model(ModelConfig.preset(preset), action_dim=2)

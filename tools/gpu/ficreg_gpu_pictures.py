@@ -1,4 +1,4 @@
-"""The pictures of ficreg_gpu.py: few, small, in one flat folder."""
+"""Figures of the report of ficreg_gpu.py."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-from ficreg_gpu_report import finished, planned, read_metrics, read_results, Runs
+from ficreg_gpu_report import finished, read_metrics, read_results, Runs
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
@@ -16,11 +16,11 @@ COLORS = {"lewm": "tab:gray", "ficreg": "tab:blue"}
 
 
 def draw_pictures(out: Path, runs: Runs, profile: dict[str, Any] | None) -> None:
-    """Draws what there is so far.
+    """Draws the figures of the finished runs.
 
     Args:
         out: folder of the report.
-        runs: finished or not.
+        runs: all runs, finished or not.
         profile: of a training step.
     """
     results = read_results(runs)
@@ -35,24 +35,24 @@ def draw_pictures(out: Path, runs: Runs, profile: dict[str, Any] | None) -> None
 
 
 def draw_success(results: dict[tuple[str, str], dict[str, Any]], target: Path) -> None:
-    """Success rates with their 95 % intervals, an environment a group, random actions as a line."""
+    """Success rates with 95 % intervals, a panel per environment, the random baseline as a line."""
     environments = sorted({env for env, _ in results})
     figure, axes = pyplot.subplots(1, len(environments), figsize=(3.2 * len(environments), 3.2), squeeze=False)
     for axis, env in zip(axes[0], environments):
         for place, (method, color) in enumerate(COLORS.items()):
             if (env, method) not in results:
                 continue
-            outcome, floor = planned(results[env, method])[1], results[env, method]["random"]
+            outcome, random = results[env, method]["policy"], results[env, method]["random"]
             low, high = outcome["success_interval"]
             rate = outcome["success_rate"]
             axis.bar(place, rate, color=color, yerr=[[rate - low], [high - rate]], capsize=4)
-            axis.axhline(floor["success_rate"], color="black", ls=":", lw=1)
+            axis.axhline(random["success_rate"], color="black", ls=":", lw=1)
         axis.set(title=env, xticks=range(len(COLORS)), xticklabels=COLORS, ylim=(0, 1), ylabel="success rate")
     save(figure, target)
 
 
 def draw_training(runs: Runs, target: Path) -> None:
-    """Prediction loss against the step, an environment a panel."""
+    """Prediction loss against the step, a panel per environment."""
     environments = sorted({env for env, _ in runs})
     figure, axes = pyplot.subplots(1, len(environments), figsize=(4 * len(environments), 3.2), squeeze=False)
     for axis, env in zip(axes[0], environments):
@@ -67,7 +67,7 @@ def draw_training(runs: Runs, target: Path) -> None:
 
 
 def draw_profile(profile: dict[str, Any], target: Path) -> None:
-    """Shares of a step by kernel, and its figures in the title."""
+    """Share of each kernel in a step, with the main numbers in the title."""
     names = list(profile["kernels"])[::-1]
     figure, axis = pyplot.subplots(figsize=(8, 4))
     axis.barh([name[:50] for name in names], [profile["kernels"][name] for name in names], color="tab:blue")
@@ -81,7 +81,7 @@ def draw_profile(profile: dict[str, Any], target: Path) -> None:
 
 
 def save(figure: Any, target: Path) -> None:
-    """Writes a picture and lets go of it."""
+    """Saves a figure and closes it."""
     figure.tight_layout()
     figure.savefig(target, dpi=110)
     pyplot.close(figure)

@@ -1,4 +1,4 @@
-"""Where the time of a training step goes on the device at hand, on the dataset and with the settings of a run."""
+"""Time of a training step by kernel, on the dataset and with the settings of a run."""
 
 from __future__ import annotations
 
@@ -18,23 +18,21 @@ from torchrl_ficreg._device import uses_bf16
 from torchrl_ficreg.trainers import OfflineTrainer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "sota-implementations" / "ficreg"))
-from episodes import dataset_path, make_dataset
-from utils import get_device, make_loss, model_config
+from utils import dataset_path, get_device, make_dataset, make_loss, model_config
 
-KERNELS = 12  # of the longest, named one by one
+KERNELS = 12  # number of kernels that are listed
 
 
 def profile(run_dir: Path, steps: int) -> dict[str, Any]:
-    """Measures training steps of a run, from a fresh start; its folder is only read.
+    """Measures training steps with a run's settings and new weights; the run's folder is only read.
 
-    ``step_seconds`` is a step as training takes it: the batch is asked for, moved and learned from.
-    ``compute_seconds`` is the same with one batch that lies on the device already. ``loader_share`` is the part of a
-    step that the device waits for data, and ``share_of_peak`` the operations of the matrix products in
-    ``compute_seconds`` over those of one large matrix product in that time.
+    ``step_seconds`` is the time of a training step with loading and transfer of its batch, ``compute_seconds`` without
+    them. ``loader_share`` is the share of a step spent waiting for data, and ``share_of_peak`` the rate of the matrix products
+    in ``compute_seconds`` relative to one large matrix product.
 
     Args:
         run_dir: folder of a run of train.py.
-        steps: how many to average over, after as many again to warm up, at most ten.
+        steps: number of steps to average over, after up to ten to warm up.
     """
     cfg = OmegaConf.load(run_dir / "config.yaml")
     device = get_device(cfg.device)
@@ -67,7 +65,7 @@ def profile(run_dir: Path, steps: int) -> dict[str, Any]:
 
 
 def fresh_trainer(cfg: DictConfig, device: torch.device) -> tuple[OfflineTrainer, Any]:
-    """The trainer and the clips of a configuration, with new weights and nothing on disk."""
+    """Trainer and clips of a configuration, with new weights and without files."""
     torch.manual_seed(cfg.seed)
     data = Path(cfg.dataset) if cfg.dataset else dataset_path(cfg)
     clips = make_dataset(cfg, data, "train", prefetch=1)
@@ -80,7 +78,7 @@ def fresh_trainer(cfg: DictConfig, device: torch.device) -> tuple[OfflineTrainer
 
 
 def training_seconds(trainer: OfflineTrainer, clips: Any, device: torch.device, steps: int) -> tuple[float, float]:
-    """Seconds of a step with its batch, and of these the seconds until the batch was handed out."""
+    """Seconds of a step with its batch, and the seconds spent waiting for the batch."""
     waited = 0.0
     wait_for(device)
     began = time.perf_counter()
@@ -94,7 +92,7 @@ def training_seconds(trainer: OfflineTrainer, clips: Any, device: torch.device, 
 
 
 def clips_per_second(clips: Any, batches: int) -> float:
-    """How fast batches come when nobody learns from them."""
+    """Throughput of the loader alone."""
     clips.sample()
     began = time.perf_counter()
     for _ in range(batches):
@@ -103,7 +101,7 @@ def clips_per_second(clips: Any, batches: int) -> float:
 
 
 def longest_kernels(trainer: OfflineTrainer, clip: Any, device: torch.device) -> dict[str, float]:
-    """Shares of the time of one step by kernel, on CUDA, or by operator, on the CPU."""
+    """Share of each kernel (CUDA) or operator (CPU) in the time of one step."""
     cuda = device.type == "cuda"
     activities = [torch.profiler.ProfilerActivity.CPU] + [torch.profiler.ProfilerActivity.CUDA] * cuda
     with torch.profiler.profile(activities=activities) as trace:
@@ -116,9 +114,9 @@ def longest_kernels(trainer: OfflineTrainer, clip: Any, device: torch.device) ->
 
 
 def seconds_by_name(events: Iterable[Any], cuda: bool) -> dict[str, float]:
-    """Time of its own of each kernel, or of each operator where ``cuda`` is false, each counted once."""
+    """Self time of each kernel, or of each operator if ``cuda`` is false."""
     if not cuda:
         return {event.key: event.self_cpu_time_total for event in events}
-    # On the device an operator repeats the time of its kernels, and so does a user's span, such as Optimizer.step.
+    # Device time of operators and of annotations such as Optimizer.step repeats that of their kernels.
     kernels = [event for event in events if event.device_type == torch.autograd.DeviceType.CUDA]
     return {e.key: e.self_device_time_total for e in kernels if not getattr(e, "is_user_annotation", False)}

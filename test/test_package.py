@@ -30,7 +30,7 @@ ORDER = (
     {"keys", "protocols", "_mujoco", "_utils", "_safe_files", "_device", "_torchrl_compat"},
     {"distributed"},
     {"data"},
-    {"envs", "modules"},
+    {"envs", "modules", "transforms"},
     {"planners", "objectives", "pretrained"},
     {"trainers"},
     {"evaluation"},

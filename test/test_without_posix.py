@@ -88,7 +88,8 @@ for epochs, begun in ((1, 0), (2, 9)):  # the second trainer continues from the 
     assert trainer.step == begun, trainer.step
     with stop_on_signal(trainer):
         trainer.train()
-assert lock_folder(here) is False  # and says so
+with lock_folder(here) as locked:
+    assert locked is False  # and says so
 with without_interrupts():
     assert resident_memory() is None or resident_memory() > 0
 rows = CsvRows(here / "table.csv")

@@ -1,7 +1,6 @@
-"""What networks, costs, planners and environments of your own must offer to work with the package.
+"""What networks, costs, planners and environments of your own must offer. Nothing has to inherit from these classes.
 
-Nothing has to inherit from these classes. T frames, latents of width D, z-scored blocks of F environment actions of A numbers,
-E environments, K candidates; "..." are any leading dimensions.
+T frames, latents of width D, z-scored blocks of F environment actions [A], E environments, K candidates, N imagined blocks.
 """
 
 from __future__ import annotations
@@ -9,18 +8,16 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 
 class Network(Protocol):
     """A TensorDictModule around a network; keys of any name, see :func:`~torchrl_ficreg.modules.feed.arrange`."""
 
-    in_keys: list[NestedKey]
-    out_keys: list[NestedKey]
+    in_keys: list[Any]  # NestedKeys, read
+    out_keys: list[Any]  # NestedKeys, written
 
-    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Reads ``in_keys`` and writes ``out_keys``."""
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase: ...
 
 
 class Encoder(Network, Protocol):
@@ -28,10 +25,9 @@ class Encoder(Network, Protocol):
 
 
 class Predictor(Network, Protocol):
-    """``latent`` [..., T, D] and ``action`` [..., T, F * A] -> ``predicted_latent`` [..., T, D].
+    """``latent`` [..., T, D] and ``action`` [..., T, F * A] -> ``predicted_latent`` [..., T, D], row t from rows up to t.
 
-    Row t predicts the latent after that of row t, from rows up to t only. D, F * A and the largest T are attributes
-    ``latent_dim``, ``action_dim``, ``history``, or arguments of LatentWorldModel. Optional: ``rollout``, as of a WorldModel.
+    D, F * A and the largest T are attributes ``latent_dim``, ``action_dim`` and ``history``, or arguments of LatentWorldModel.
     """
 
 
@@ -51,22 +47,21 @@ class WorldModel(Protocol):
     def encode(self, pixels: Tensor) -> Tensor:
         """Frames [..., 3, H, W] -> latents [..., D]."""
 
-    def rollout(self, latent: Tensor, action: Tensor) -> Tensor:
+    def rollout(self, latent: Tensor, action: Tensor) -> Tensor:  # optional method of a Predictor too
         """Context [..., C, D] and blocks [..., C - 1 + N, F * A] -> predictions [..., N, D]."""
 
 
 class Cost(Protocol):
-    """Costs of candidates, lower is better; ``action`` and ``start`` may be left out of the signature."""
+    """Predicted [E, K, T, D], goal [E, D] and, if named, action [E, K, T, F * A], start [E, D] -> costs [E, K] to minimise."""
 
-    def __call__(self, predicted: Tensor, goal: Tensor, *, action: Tensor, start: Tensor) -> Tensor:
-        """Predicted [E, K, T, D], goal [E, D], action [E, K, T, F * A] and start [E, D] -> [E, K]."""
+    def __call__(self, predicted: Tensor, goal: Tensor, *, action: Tensor, start: Tensor) -> Tensor: ...
 
 
 class Planner(Protocol):
     """What MPCPolicy asks; of the keywords ``past_action`` [E, C - 1, F * A], ``initial`` [E, horizon, F * A], both optional."""
 
     world_model: WorldModel
-    config: Any  # PlanConfig, of which ``horizon``, ``receding_horizon`` and ``warm_start`` are read
+    config: Any  # with ``horizon``, ``receding_horizon`` and ``warm_start``, as a PlanConfig
     context: int  # most frames C of a context
     action_bounds: tuple[Tensor, Tensor] | None  # (low [A], high [A]) in environment units
 

@@ -180,6 +180,11 @@ def test_modules_tell_the_arguments_of_their_inputs():
     assert compat.keyword_arguments(nn.Linear(1, 1)) is None
 
 
+def test_a_compiled_module_gives_back_the_module():
+    layer = nn.Linear(1, 1)
+    assert compat.without_compile(torch.compile(layer)) is layer and compat.without_compile(layer) is layer
+
+
 def test_a_copy_with_another_child_shares_the_rest():
     pair = nn.Sequential(nn.Linear(1, 1), nn.Linear(1, 1))
     other = compat.with_child(pair, "1", nn.Identity())

@@ -52,6 +52,7 @@ __all__ = [
     "unhook_wandb",
     "use_one_reader",
     "with_child",
+    "without_compile",
 ]
 
 _Module = TypeVar("_Module", bound=nn.Module)
@@ -156,6 +157,11 @@ def use_one_reader(buffer: ReplayBuffer) -> None:
 def keyword_arguments(module: nn.Module) -> Sequence[str] | None:
     """Arguments that a ``TensorDictModule`` passes its ``in_keys`` to, in their order; None where it has no such names."""
     return getattr(module, "_kwargs", None)
+
+
+def without_compile(module: Any) -> Any:
+    """The module that ``torch.compile`` wrapped; anything else as it is."""
+    return getattr(module, "_orig_mod", module)
 
 
 def with_child(module: _Module, name: str, child: nn.Module) -> _Module:

@@ -17,6 +17,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torchrl_ficreg._torchrl_compat import without_compile
 from torchrl_ficreg.keys import LATENT, NEXT_LATENT, RECOVERED_ACTION
 from torchrl_ficreg.modules.feed import arrange, feed, read_output, require_module
 
@@ -194,7 +195,7 @@ def keywords_of(cost: Cost) -> tuple[str, ...]:
         raise TypeError(
             f"a cost is a module or function (predicted, goal) -> [E, K], such as GoalDistance(), got {cost!r}."
         )
-    cost = getattr(cost, "_orig_mod", cost)  # of torch.compile, whose own signature takes everything
+    cost = without_compile(cost)  # a compiled module takes everything
     try:
         parameters = inspect.signature(cost.forward if isinstance(cost, nn.Module) else cost).parameters
     except ValueError:  # a ScriptFunction, for example, has no signature

@@ -17,7 +17,7 @@ class Network(Protocol):
     in_keys: list[Any]  # NestedKeys, read
     out_keys: list[Any]  # NestedKeys, written
 
-    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase: ...
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase: ...  # noqa: D102
 
 
 class Encoder(Network, Protocol):
@@ -54,7 +54,7 @@ class WorldModel(Protocol):
 class Cost(Protocol):
     """Predicted [E, K, T, D], goal [E, D] and, if named, action [E, K, T, F * A], start [E, D] -> costs [E, K] to minimise."""
 
-    def __call__(self, predicted: Tensor, goal: Tensor, *, action: Tensor, start: Tensor) -> Tensor: ...
+    def __call__(self, predicted: Tensor, goal: Tensor, *, action: Tensor, start: Tensor) -> Tensor: ...  # noqa: D102
 
 
 class Planner(Protocol):

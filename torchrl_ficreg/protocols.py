@@ -12,12 +12,10 @@ from torch import Tensor
 
 
 class Network(Protocol):
-    """A TensorDictModule around a network; keys of any name, see :func:`~torchrl_ficreg.modules.feed.arrange`."""
+    """A TensorDictModule; ``in_keys`` and ``out_keys`` of any name, see :func:`~torchrl_ficreg.modules.feed.arrange`."""
 
-    in_keys: list[Any]  # NestedKeys, read
-    out_keys: list[Any]  # NestedKeys, written
-
-    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase: ...  # noqa: D102
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Reads ``in_keys`` and writes ``out_keys``, both lists of NestedKey."""
 
 
 class Encoder(Network, Protocol):
@@ -52,9 +50,10 @@ class WorldModel(Protocol):
 
 
 class Cost(Protocol):
-    """Predicted [E, K, T, D], goal [E, D] and, if named, action [E, K, T, F * A], start [E, D] -> costs [E, K] to minimise."""
+    """Costs of candidates, lower is better; ``action`` and ``start`` may be left out of the signature."""
 
-    def __call__(self, predicted: Tensor, goal: Tensor, *, action: Tensor, start: Tensor) -> Tensor: ...  # noqa: D102
+    def __call__(self, predicted: Tensor, goal: Tensor, *, action: Tensor, start: Tensor) -> Tensor:
+        """Predicted [E, K, T, D], goal [E, D], action [E, K, T, F * A] and start [E, D] -> [E, K]."""
 
 
 class Planner(Protocol):

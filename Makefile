@@ -13,9 +13,9 @@ FAST := test/test_package.py test/test_without_posix.py test/data test/objective
 train: $(READY)
 	$(RUN) sota-implementations/ficreg/train.py $(ARGS)
 
-# One process for each core, at most 8, with one thread each. In one process: make test ARGS="-n 0".
+# One process for each core, at most 4, with one thread each. In one process: make test ARGS="-n 0".
 test: $(TESTABLE)
-	OMP_NUM_THREADS=1 $(PYTEST) -n auto --maxprocesses 8 --dist loadfile $(ARGS)
+	OMP_NUM_THREADS=1 $(PYTEST) -n auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 # The fast tests on every Python of $(PYTHONS) that is installed (pyenv's too), each in its own .venv-3.XX.
 test-pythons:

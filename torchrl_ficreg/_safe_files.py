@@ -144,6 +144,36 @@ def read_config(file: Path, kind: str, version: int, *, instead: str) -> dict[st
     return content
 
 
+def open_model_folder(
+    folder: Path, weights_name: str, config_name: str, kind: str, version: int, *, writer: str, instead: str
+) -> tuple[Path, Path, dict[str, Any], dict[str, tuple[int, ...]]]:
+    """Finds the two files of a saved model and reads what can be read of them without its tensors.
+
+    Args:
+        folder (Path): the folder.
+        weights_name (str): name of the safetensors file.
+        config_name (str): name of the configuration.
+        kind (str): see :func:`read_config`, as ``version`` and ``instead``.
+        version (int): see there.
+        writer (str): what writes such folders, for an error.
+        instead (str): see there.
+
+    Returns:
+        the file of weights, that of the configuration, its content, and the shapes of the weights by name.
+
+    Raises:
+        ImportError: safetensors is not installed.
+        FileNotFoundError: one of the files is missing.
+        ValueError: see :func:`read_config` and :func:`read_shapes`.
+    """
+    require_safetensors()
+    weights, config = folder / weights_name, config_file(folder / weights_name, folder / config_name)
+    for file in (config, weights):
+        if not file.exists():
+            raise FileNotFoundError(f"no {file.name} in {folder}: give a folder that {writer} wrote.")
+    return weights, config, read_config(config, kind, version, instead=instead), read_shapes(weights)
+
+
 def read_shapes(file: Path) -> dict[str, tuple[int, ...]]:
     """Reads names and shapes of a safetensors file from its header.
 

@@ -53,6 +53,16 @@ def world_size() -> int:
     return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
+def planned_world_size() -> int:
+    """Number of processes that share a batch: those of the process group, or those that ``torchrun`` started for one.
+
+    Examples:
+        >>> planned_world_size()
+        1
+    """
+    return max(world_size(), torchrun_world_size())
+
+
 def torchrun_world_size() -> int:
     """Number of processes that ``torchrun`` started, whether or not they have a process group yet; 1 without it.
 

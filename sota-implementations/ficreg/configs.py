@@ -26,7 +26,7 @@ from utils import describe_env, get_device, make_loss, model_config, plan_config
 from torchrl_ficreg import LatentWorldModel, make_world_model, ModelConfig
 from torchrl_ficreg.data.dataset import split_episodes, SPLITS
 from torchrl_ficreg.data.frames import check_frame_format
-from torchrl_ficreg.distributed import torchrun_world_size, world_size
+from torchrl_ficreg.distributed import planned_world_size
 from torchrl_ficreg.envs.collect import EpisodeRecorder
 from torchrl_ficreg.envs.registry import find_entry
 from torchrl_ficreg.keys import GOAL_STATE, STATE
@@ -357,7 +357,7 @@ def check_settings(cfg: DictConfig, training: bool = True) -> None:
         raise ValueError(f"evaluation.epoch must be null or an epoch from 1 to optim.epochs={optim.epochs}, got {epoch}.")
     if epoch is not None and cfg.refine.steps:
         raise ValueError(f"evaluation.epoch={epoch} leaves no use for refine.steps={cfg.refine.steps}: set one to null or 0.")
-    local = optim.batch_size // _num_processes()
+    local = optim.batch_size // planned_world_size()
     if optim.accumulate > 1 and local % (2 * optim.accumulate):
         raise ValueError(
             f"optim.accumulate={optim.accumulate} must divide the {local} clips of a process into equal micro-batches of at "
@@ -427,10 +427,6 @@ def check_consistency(plan: DictConfig, config: DictConfig | dict[str, Any]) -> 
         )
 
 
-def _num_processes() -> int:
-    return max(world_size(), torchrun_world_size())
-
-
 def _check_networks(cfg: DictConfig) -> LatentWorldModel:
     """Lets networks and loss check their settings, on the meta device, where they take no memory.
 
@@ -459,7 +455,7 @@ def _check_networks(cfg: DictConfig) -> LatentWorldModel:
         available = torch.cuda.get_device_properties(device).total_memory
     else:
         available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else need
-    available *= _num_processes()
+    available *= planned_world_size()
     if need > available:
         raise ValueError(
             f"networks of {len(params)} tensors and {need / 16e9:.1f} billion weights take {need / 1e9:.0f} GB to train, this "

@@ -16,9 +16,7 @@ from torchrl_ficreg._safe_files import (
     check_sizes,
     CHECKSUM,
     checksum_of,
-    config_file,
-    read_config,
-    read_shapes,
+    open_model_folder,
     read_tensors,
     require_safetensors,
     save_model,
@@ -309,14 +307,9 @@ def load_goal_policy(
         ValueError: another format or version, damaged files, files that do not belong together, or a world model of
             other widths, encoder weights or action statistics than the policy's own.
     """
-    require_safetensors()
     folder = Path(folder).expanduser()
-    weights, config = folder / WEIGHTS_FILE, config_file(folder / WEIGHTS_FILE, folder / CONFIG_FILE)
-    for file in (config, weights):
-        if not file.exists():
-            raise FileNotFoundError(f"no {file.name} in {folder}: give a folder that save_goal_policy or train_policy.py wrote.")
-    content = read_config(config, FORMAT, VERSION, instead="give a folder that save_goal_policy wrote.")
-    shapes = read_shapes(weights)
+    advice = {"writer": "save_goal_policy or train_policy.py", "instead": "give a folder that save_goal_policy wrote."}
+    weights, _, content, shapes = open_model_folder(folder, WEIGHTS_FILE, CONFIG_FILE, FORMAT, VERSION, **advice)
     try:
         sizes, checksum = content["sizes"], content["world_model"]
         check_sizes(sizes, len(shapes))

@@ -16,10 +16,8 @@ from torchrl_ficreg._safe_files import (
     check_shapes,
     check_sizes,
     CHECKSUM,
-    config_file,
     json_text,
-    read_config,
-    read_shapes,
+    open_model_folder,
     read_tensors,
     require_safetensors,
     save_model,
@@ -168,14 +166,9 @@ def load_pretrained(
         FileNotFoundError: no such files.
         ValueError: another format or version, damaged files, or files that do not belong together.
     """
-    require_safetensors()
     folder = Path(folder).expanduser()
-    weights, config = folder / WEIGHTS_FILE, config_file(folder / WEIGHTS_FILE, folder / CONFIG_FILE)
-    for file in (config, weights):
-        if not file.exists():
-            raise FileNotFoundError(f"no {file.name} in {folder}: give a folder that save_pretrained wrote.")
-    content = read_config(config, FORMAT, VERSION, instead="an official LeWM checkpoint is read by load_lewm.")
-    shapes = read_shapes(weights)
+    advice = {"writer": "save_pretrained", "instead": "an official LeWM checkpoint is read by load_lewm."}
+    weights, config, content, shapes = open_model_folder(folder, WEIGHTS_FILE, CONFIG_FILE, FORMAT, VERSION, **advice)
     try:
         described = {_MODEL: content[_MODEL]} | ({} if content[_INVERSE] is None else {_INVERSE: content[_INVERSE]})
         check_sizes(described, len(shapes))

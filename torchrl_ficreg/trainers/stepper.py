@@ -14,7 +14,7 @@ from torchrl.trainers.trainers import OptimizationStepper
 
 from torchrl_ficreg._device import autocast, Precision
 from torchrl_ficreg._torchrl_compat import step_count
-from torchrl_ficreg.distributed import all_reduce_mean, rank, torchrun_world_size, world_size
+from torchrl_ficreg.distributed import all_reduce_mean, planned_world_size, rank, world_size
 
 
 class OfflineStepper(OptimizationStepper):
@@ -174,7 +174,7 @@ def check_batch_size(batch_size: int) -> None:
     Examples:
         >>> check_batch_size(128)
     """
-    ranks = max(world_size(), torchrun_world_size())
+    ranks = planned_world_size()
     if batch_size % ranks or 0 < batch_size < 2 * ranks:
         raise ValueError(
             f"optim.batch_size={batch_size} counts the clips of all {ranks} processes: give a multiple of {ranks}, and "

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from torchrl_ficreg._utils import read_json, require_regular_file, write_atomic
+from torchrl_ficreg._utils import read_json, require, require_regular_file, write_atomic
 
 CHECKSUM = "weights_sha256"  # field of a configuration: the SHA-256 of the file of weights beside it
 _LARGEST = 2**20  # of any size of a network
@@ -23,16 +23,12 @@ _STAGED = ".next"
 
 
 def require_safetensors() -> ModuleType:
-    """Imports safetensors, which saves models and policies; called before training starts.
+    """Imports ``safetensors.torch``, which saves models and policies; called before training starts.
 
     Raises:
         ImportError: safetensors is not installed.
     """
-    try:
-        import safetensors.torch
-    except ImportError as error:
-        raise ImportError("safetensors is missing: pip install 'torchrl_ficreg[pretrained]'.") from error
-    return safetensors
+    return require("safetensors.torch", "pretrained", purpose="a saved model", package="safetensors")
 
 
 def save_model(
@@ -52,7 +48,7 @@ def save_model(
         TypeError, ValueError: the configuration has values that JSON does not have.
         OSError: the files cannot be written; the old ones stay as they are.
     """
-    data = require_safetensors().torch.save(as_float32(state), metadata={"format": "pt"})
+    data = require_safetensors().save(as_float32(state), metadata={"format": "pt"})
     text = json_text({**content, CHECKSUM: hashlib.sha256(data).hexdigest()})
     replace_files(folder, (weights, data), (config, text))
 
@@ -200,12 +196,14 @@ def read_tensors(file: Path, digest: Any = None) -> dict[str, torch.Tensor]:
     Raises:
         ValueError: the file is damaged, has another checksum, or contains values that :func:`check_numbers` refuses.
     """
-    safetensors = require_safetensors()
+    load_file = require_safetensors().load_file
     if digest is not None and digest != _digest(file):
         raise ValueError(f"{file} has another checksum than the configuration beside it notes: it is damaged, restore both.")
+    from safetensors import SafetensorError
+
     try:
-        tensors = safetensors.torch.load_file(file)
-    except (safetensors.SafetensorError, KeyError) as error:
+        tensors = load_file(file)
+    except (SafetensorError, KeyError) as error:
         raise ValueError(f"{file} is damaged ({error}): restore it.") from error
     check_numbers(tensors, file)
     return tensors

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from torchrl import torchrl_logger
 
-from torchrl_ficreg._utils import ONE_THREAD
+from torchrl_ficreg._utils import ONE_THREAD, require
 from torchrl_ficreg.data.frames import FrameFormat
 from torchrl_ficreg.data.layout import META_FILE
 from torchrl_ficreg.data.shards import NUM_SHARDS, SHARD, shard_meta, SHARD_NUMBER
@@ -227,10 +227,7 @@ def collect_on_ray(
     left = [shard for shard in shards if not _is_complete(*shard)]
     if not left:
         return folder
-    try:
-        import ray
-    except ImportError as error:
-        raise ImportError("recording on Ray needs Ray: pip install 'torchrl_ficreg[ray]'.") from error
+    ray = require("ray", "ray", purpose="recording on Ray", package="Ray")
     session = None if ray.is_initialized() else ray.init()
     record = ray.remote(num_cpus=1, runtime_env={"env_vars": ONE_THREAD})(_record_shard)
     tasks = {record.remote(*shard, name, settings): shard[0] for shard in left}

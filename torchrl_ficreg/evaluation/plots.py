@@ -9,20 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_ficreg._utils import read_bytes, write_atomic
+from torchrl_ficreg._utils import read_bytes, require, write_atomic
 from torchrl_ficreg.evaluation.metrics import DistanceProfile
 from torchrl_ficreg.evaluation.mpc import Evaluation
 
 
 def _pyplot():
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise ImportError("pictures need matplotlib: pip install 'torchrl_ficreg[plot]'.") from error
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot
+    require("matplotlib", "plot", purpose="a picture").use("Agg")
+    return require("matplotlib.pyplot", "plot", purpose="a picture", package="matplotlib")
 
 
 def plot_learning_curve(metrics: Path, target: Path) -> None:
@@ -99,10 +93,7 @@ def save_episodes_gif(evaluation: Evaluation, target: Path, *, scale: int = 2, f
         ImportError: imageio is missing.
         ValueError: no episode was recorded.
     """
-    try:
-        import imageio.v3 as imageio
-    except ImportError as error:
-        raise ImportError("a GIF needs imageio: pip install 'torchrl_ficreg[plot]'.") from error
+    imageio = require("imageio.v3", "plot", purpose="a GIF", package="imageio")
     if not evaluation.frames:
         raise ValueError("no episode was recorded: evaluate with record=4, say.")
     reached = np.maximum.accumulate(evaluation.success, axis=1)

@@ -2,8 +2,8 @@
 
 All read ``latent`` and ``("next", "latent")`` [..., T, D] and write ``recovered_action`` [..., T, F * A], z-scored. Two
 also write an uncertainty of every dimension: a Gaussian head ``recovered_action_log_var``, an ensemble
-``recovered_action_variance``, the variance among its members. None contains a BatchNorm: the losses also apply them to
-predicted transitions, which would change its running statistics.
+``recovered_action_variance``, the variance among its members. None contains a BatchNorm, which would normalise predicted
+transitions by their own statistics in train mode, and hide from the consistency term what all predictions have in common.
 """
 
 from __future__ import annotations

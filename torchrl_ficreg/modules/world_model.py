@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch, TensorDictModuleBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 
 from torchrl_ficreg.data.action_statistics import ActionStatistics
 from torchrl_ficreg.keys import ACTION, LATENT, PIXELS, PREDICTED_LATENT
@@ -21,10 +21,11 @@ from torchrl_ficreg.modules.feed import (
     require_module,
     require_tensordict,
 )
+from torchrl_ficreg.modules.keyed import KeyedMixin
 from torchrl_ficreg.modules.layers import check_finite
 
 
-class LatentWorldModel(TensorDictModuleBase):
+class LatentWorldModel(KeyedMixin, TensorDictModuleBase):
     """An encoder and a predictor, as one model to plan with.
 
     The networks may be any TensorDictModules, see :mod:`torchrl_ficreg.protocols`. The model holds the statistics of the
@@ -92,7 +93,7 @@ class LatentWorldModel(TensorDictModuleBase):
         torch.Size([7, 1, 16])
     """
 
-    @dataclass
+    @dataclass(frozen=True)
     class _AcceptedKeys:
         """Keys that :meth:`set_keys` can rename.
 
@@ -109,8 +110,6 @@ class LatentWorldModel(TensorDictModuleBase):
         action: NestedKey = ACTION
         latent: NestedKey = LATENT
         predicted_latent: NestedKey = PREDICTED_LATENT
-
-    default_keys = _AcceptedKeys
 
     def __init__(
         self,
@@ -133,8 +132,7 @@ class LatentWorldModel(TensorDictModuleBase):
                 f"a world model has in_keys [pixels, action] and out_keys [latent, predicted_latent], got {list(in_keys)} and "
                 f"{list(out_keys)}."
             )
-        self.tensor_keys = self._AcceptedKeys(*in_keys, *out_keys)
-        self._list_keys()
+        self.set_keys(**dict(zip(("pixels", "action", "latent", "predicted_latent"), (*in_keys, *out_keys))))
         self.encoder, self.predictor = encoder, predictor
         arrange("predictor", predictor.in_keys, self._names())
         self.frame_skip = _size("frame_skip", frame_skip)
@@ -151,26 +149,7 @@ class LatentWorldModel(TensorDictModuleBase):
         if statistics is not None:
             self.statistics = statistics
 
-    def set_keys(self, **keys: NestedKey | None) -> None:
-        """Renames keys of :meth:`forward`, as ``set_keys`` of a TorchRL loss does.
-
-        Args:
-            **keys: ``pixels``, ``action``, ``latent`` or ``predicted_latent``; None for the default.
-
-        Raises:
-            ValueError: another name.
-        """
-        accepted = [field.name for field in fields(self._AcceptedKeys)]
-        unknown = sorted(keys.keys() - set(accepted))
-        if unknown:
-            raise ValueError(f"a world model has no key {', '.join(unknown)}: choose among {', '.join(accepted)}.")
-        default = self.default_keys()
-        given = {name: unravel_key(getattr(default, name) if key is None else key) for name, key in keys.items()}
-        for name, key in given.items():
-            setattr(self.tensor_keys, name, key)
-        self._list_keys()
-
-    def _list_keys(self) -> None:
+    def _apply_keys(self) -> None:
         keys = self.tensor_keys
         self.in_keys, self.out_keys = [keys.pixels, keys.action], [keys.latent, keys.predicted_latent]
 

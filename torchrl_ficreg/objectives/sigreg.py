@@ -6,12 +6,11 @@ import math
 from typing import Literal
 
 import torch
-import torch.distributed as dist
 from torch import nn
 
 from torchrl_ficreg._device import without_autocast
 from torchrl_ficreg._torchrl_compat import in_functorch_transform
-from torchrl_ficreg.distributed import all_reduce_sum, world_size
+from torchrl_ficreg.distributed import all_reduce_sum
 
 
 class SIGReg(nn.Module):
@@ -158,10 +157,8 @@ def _epps_pulley(
             if knot:
                 power.mul_(base)
             torch.sum(power, 0, out=total[knot, time])
-    count = _counts(angle, mask)
-    if world_size() > 1:
-        dist.all_reduce(torch.view_as_real(total))
-        dist.all_reduce(count)
+    total = torch.view_as_complex(all_reduce_sum(torch.view_as_real(total)))  # no backend has to know complex numbers
+    count = all_reduce_sum(_counts(angle, mask))  # [T]
     deviation = total / count.clamp_min(1).unsqueeze(-1) - gaussian.view(-1, 1, 1)  # [K, T, M]
     distance = torch.einsum("ktm,k->tm", torch.view_as_real(deviation).square().sum(-1), weight)
     return count.unsqueeze(-1) * distance, unit, deviation
@@ -186,9 +183,7 @@ def _epps_pulley_backward(
 
     d/d(angle) = 2 sum_k weight_k k Re(conj(deviation_k) i z^k), the factor B having cancelled the 1/B of the mean.
     """
-    grad = grad.clone()
-    if world_size() > 1:
-        dist.all_reduce(grad)
+    grad = all_reduce_sum(grad)
     order = torch.arange(1, len(weight) + 1, device=weight.device, dtype=weight.dtype)
     slope = (2 * order * weight).view(-1, 1, 1) * grad  # [K, T, M]
     coefficient = slope * deviation.conj() * 1j  # [K, T, M]

@@ -2,7 +2,7 @@
 
 To read the cross-entropy method, read ``config.py`` (settings), this file (``plan`` and ``Problem.cost``) and ``cem.py``
 (loop and update). Left out there: input checks (``inputs.py``), bounds of z-scored blocks (``bounds.py``), the bfloat16 copy
-of the predictor (``dynamics.py``) and ``set_keys`` (``keyed.py``).
+of the predictor (``dynamics.py``) and ``set_keys`` (``modules/keyed.py``).
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from torchrl_ficreg._device import autocast, keep_freed_memory
 from torchrl_ficreg.keys import ACTION, GOAL_LATENT, LATENT, PAST_ACTION, PLAN, PLAN_COST, PLAN_SEED, TRACE
 from torchrl_ficreg.modules.feed import require_tensordict
 from torchrl_ficreg.modules.goal_policy import GoalPolicy
+from torchrl_ficreg.modules.keyed import KeyedMixin
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 from torchrl_ficreg.planners.bounds import block_bounds, check_bounds
 from torchrl_ficreg.planners.config import PlanConfig
 from torchrl_ficreg.planners.costs import call_cost, Cost, GoalDistance, keywords_of
 from torchrl_ficreg.planners.dynamics import BFloat16Copy, plans_in_bf16, predictor_dtype, rollouts_within
 from torchrl_ficreg.planners.inputs import check_inputs, PlanInputs
-from torchrl_ficreg.planners.keyed import KeyedMixin
 
 ROWS_AT_ONCE = 512  # candidates that keep the cores of a CPU busy
 

@@ -12,8 +12,9 @@ class GoalPolicyPlanner(LatentPlanner):
     """Returns what a goal-conditioned policy does (arXiv 2605.08732): one forward pass per block instead of a search.
 
     Blocks beyond the first are imagined: policy and world model alternate. With ``receding_horizon=1`` the policy acts on real
-    frames only. See :class:`~torchrl_ficreg.LatentPlanner` for the entries that are read and written; ``policy`` is required,
-    and the settings are a :class:`~torchrl_ficreg.PlanConfig`. The scripts call this planner ``plan=policy``.
+    frames only. See :class:`~torchrl_ficreg.LatentPlanner` for the entries that are read and written; without iterations
+    there is no ``trace``. ``policy`` is required, and the settings are a :class:`~torchrl_ficreg.PlanConfig`. The scripts call
+    this planner ``plan=policy``.
 
     Raises:
         ValueError: no policy, or ``num_proposals`` of 0.
@@ -32,6 +33,10 @@ class GoalPolicyPlanner(LatentPlanner):
         super().__init__(*args, **kwargs)
         if self.policy is None or not self.config.num_proposals:
             raise ValueError("GoalPolicyPlanner needs a policy=, see train_policy.py, and num_proposals above 0.")
+
+    def _apply_keys(self) -> None:
+        super()._apply_keys()
+        self.out_keys = self.out_keys[:3]  # no trace: there are no iterations
 
     def _search(self, problem: Problem) -> TensorDict:
         plan = problem.proposals[:, 0]  # [e, horizon, F * A]

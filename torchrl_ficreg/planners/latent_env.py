@@ -13,9 +13,9 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_ficreg.keys import ACTION, GOAL_LATENT, LATENT, PAST_ACTION, PAST_LATENT, PAST_LENGTH
+from torchrl_ficreg.modules.keyed import KeyedMixin
 from torchrl_ficreg.modules.world_model import LatentWorldModel
 from torchrl_ficreg.planners.bounds import block_bounds, check_bounds
-from torchrl_ficreg.planners.keyed import KeyedMixin
 
 _REWARDS = ("progress", "distance")
 

@@ -22,8 +22,8 @@ from torchrl_ficreg.keys import (
     PLAN_SEED,
 )
 from torchrl_ficreg.modules.feed import require_tensordict
+from torchrl_ficreg.modules.keyed import KeyedMixin
 from torchrl_ficreg.planners.base import LatentPlanner, mix_seeds
-from torchrl_ficreg.planners.keyed import KeyedMixin
 
 
 class MPCPolicy(KeyedMixin, TensorDictModuleBase):

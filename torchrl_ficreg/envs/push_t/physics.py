@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_ficreg._utils import require
 from torchrl_ficreg.envs._angles import wrap_angle
 from torchrl_ficreg.envs.push_t.geometry import (
     AGENT_RADIUS,
@@ -22,10 +23,7 @@ from torchrl_ficreg.envs.push_t.geometry import (
     WALL_RADIUS,
 )
 
-try:
-    import pymunk
-except ImportError as error:
-    raise ImportError("PushT needs pymunk: pip install 'torchrl_ficreg[envs]'.") from error
+pymunk = require("pymunk", "envs", purpose="PushT")
 
 BLOCK_MASS, BLOCK_MOMENT = 1.0, 3000.0
 ACTION_SCALE = 100.0  # px of target shift per unit of action

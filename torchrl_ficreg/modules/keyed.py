@@ -8,7 +8,7 @@ from tensordict.utils import NestedKey, unravel_key
 
 
 class KeyedMixin:
-    """Adds ``tensor_keys`` and :meth:`set_keys` to a planner, a policy or an environment.
+    """Adds ``tensor_keys`` and :meth:`set_keys` to a world model, a planner, a policy or an environment.
 
     A subclass defines its default keys as a dataclass ``_AcceptedKeys``, calls :meth:`set_keys` in its constructor and
     overrides :meth:`_apply_keys`.

@@ -30,7 +30,7 @@ class Predictor(Network, Protocol):
 
 
 class InverseModel(Network, Protocol):
-    """``latent`` and ``("next", "latent")`` [..., T, D] -> ``recovered_action`` [..., T, F * A], without BatchNorm."""
+    """``latent`` and ``("next", "latent")`` [..., T, D] -> ``recovered_action`` [..., T, F * A]."""
 
 
 class WorldModel(Protocol):

@@ -55,11 +55,6 @@ def _positive() -> Any:
     return _setting(lambda value: value > 0, "more than 0")
 
 
-def _between(low: float, high: float, high_included: bool = True) -> Any:
-    end = "]" if high_included else ")"
-    return _setting(lambda value: low <= value < high or high_included and value == high, f"a number in [{low}, {high}{end}")
-
-
 def _seed() -> Any:
     return _setting(lambda value: 0 <= value < 2**63, "0 to 2^63 - 1")
 
@@ -115,17 +110,23 @@ class Loss:
 
 
 @dataclasses.dataclass
-class Optim:
-    """``optim``: one training."""
+class AdamW:
+    """What ``optim`` has in every script that trains."""
 
-    epochs: int = _at_least(1)
-    schedule_epochs: Optional[int] = MISSING
     batch_size: int = _at_least(1)
     lr: float = _positive()
     weight_decay: float = _setting(lambda value: value >= 0, "at least 0")
-    warmup: float = _between(0, 1, high_included=False)
+    warmup: float = _setting(lambda value: 0 <= value < 1, "a number in [0, 1)")
     clip_norm: float = _positive()
     precision: str = _choice("auto", "fp32", "bf16")
+
+
+@dataclasses.dataclass
+class Optim(AdamW):
+    """``optim`` of train.py."""
+
+    epochs: int = _at_least(1)
+    schedule_epochs: Optional[int] = MISSING
     validation_batches: int = _at_least(1)
     accumulate: int = _at_least(1)
     checkpoint_activations: bool = MISSING
@@ -249,16 +250,10 @@ class PolicyNetwork:
 
 
 @dataclasses.dataclass
-class PolicyOptim:
+class PolicyOptim(AdamW):
     """``optim`` of train_policy.py."""
 
     steps: int = _at_least(1)
-    batch_size: int = _at_least(1)
-    lr: float = _positive()
-    weight_decay: float = _setting(lambda value: value >= 0, "at least 0")
-    warmup: float = _between(0, 1, high_included=False)
-    clip_norm: float = _positive()
-    precision: str = _choice("auto", "fp32", "bf16")
 
 
 @dataclasses.dataclass

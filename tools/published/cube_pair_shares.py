@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +34,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[2] / "docs/results/cube_pair_shares.json")
     arguments = parser.parse_args()
     arm = CubeArm()
-    records = [record(arm, arguments.seed, index) for index in range(arguments.episodes)]
-    report = {"episodes": arguments.episodes, "seed": arguments.seed, **summarize(*map(np.stack, zip(*records)))}
+    records = record(arm, arguments.seed, range(arguments.episodes))
+    report = {"episodes": arguments.episodes, "seed": arguments.seed, **summarize(*records)}
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(json.dumps(report, indent=2) + "\n")
     print(json.dumps(report, indent=2))
@@ -43,20 +44,29 @@ def main() -> None:
         raise SystemExit(f"more than {TOLERANCE:.0%} away from the published share: {off}")
 
 
-def record(arm: CubeArm, seed: int, index: int, steps: int = STEPS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States [steps + 1, 41], actions [steps, 5] and the goal state [41] of one episode."""
-    task_seed, expert_seed = np.random.SeedSequence(seed, spawn_key=(index,)).spawn(2)
-    rng, _ = np_random(int(task_seed.generate_state(1)[0]))
-    state = sample_start(rng, arm)
-    goal = sample_goal(rng, state, arm)
-    expert = CubeExpert(rng=np.random.default_rng(expert_seed))
+def record(arm: CubeArm, seed: int, episodes: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States [E, STEPS + 1, 41], actions [E, STEPS, 5] and goal states [E, 41] of the episodes of these numbers."""
+    records = []
+    for index in episodes:
+        task_seed, expert_seed = np.random.SeedSequence(seed, spawn_key=(index,)).spawn(2)
+        rng, _ = np_random(int(task_seed.generate_state(1)[0]))
+        state = sample_start(rng, arm)
+        goal = sample_goal(rng, state, arm)
+        expert = CubeExpert(rng=np.random.default_rng(expert_seed))
+        records.append((*play(arm, expert, state, goal, STEPS), goal))
+    states, actions, goals = map(np.stack, zip(*records))
+    return states, actions, goals
+
+
+def play(arm: CubeArm, expert: CubeExpert, state: np.ndarray, goal: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """States [steps + 1, 41] and actions [steps, 5] of an expert that starts from a state [41]."""
     arm.restore(state)
     states, actions = [state], []
     for _ in range(steps):
         actions.append(expert(states[-1], goal))
         arm.step(actions[-1].astype(np.float64))
         states.append(arm.state)
-    return np.stack(states), np.stack(actions), goal
+    return np.stack(states), np.stack(actions)
 
 
 def summarize(states: np.ndarray, actions: np.ndarray, goals: np.ndarray) -> dict:

@@ -97,8 +97,8 @@ class OfflineTrainer(BaseTrainer):
         progress_bar (bool, optional): show a progress bar. Default: ``True``.
 
     Raises:
-        ValueError: an argument is out of range, the buffer serves incomplete batches or those of another rank, or the
-            loss is not a mean.
+        ValueError: an argument is out of range, the buffer stores single steps, serves incomplete batches or those of
+            another rank, or the loss is not a mean.
 
     Examples:
         >>> import numpy as np

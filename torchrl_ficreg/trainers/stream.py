@@ -76,8 +76,21 @@ class ReplayStream:
 
     @property
     def num_frames(self) -> int:
-        """T, frames of a clip."""
-        return getattr(self.replay_buffer, "num_frames", None) or self.replay_buffer[[0]].batch_size[1]
+        """T, frames of a clip.
+
+        Raises:
+            ValueError: the buffer stores single steps, which only a transform joins into clips.
+        """
+        buffer = self.replay_buffer
+        if frames := getattr(buffer, "num_frames", None):
+            return frames
+        stored = getattr(buffer, "storage", buffer)[[0]]
+        if len(stored.batch_size) < 2:
+            raise ValueError(
+                "the training buffer stores single steps [N], expected clips [N, T]: extend it with slices of T steps (of "
+                "T * frame_skip steps with an ActionBlocks transform), or use OfflineTrajectories."
+            )
+        return buffer[[0]].batch_size[1]
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         while True:

@@ -1,11 +1,4 @@
-"""Claims about opening a dataset.
-
-1.  Each kind of damage is reported in one line that names the file, the line or the episode.
-2.  A dataset that is absent or not complete is refused with the command that collects it.
-3.  Writing into a mapped array never reaches the files, nor another opening of them.
-4.  A dataset much larger than memory can be opened.
-5.  The fingerprint changes with the content, and is the same on disk and in memory.
-"""
+"""Datasets open as they were written, or are refused in one line; what is written into the arrays never reaches the files."""
 
 from __future__ import annotations
 
@@ -16,30 +9,6 @@ import pytest
 
 from torchrl_ficreg.data import EpisodeStore
 from torchrl_ficreg.data.layout import Header, INDEX_FILE, IndexEntry, write_header
-
-
-def edit(file, old, new):
-    text = file.read_bytes()
-    assert old in text
-    file.write_bytes(text.replace(old, new, 1))
-
-
-@pytest.mark.parametrize(
-    "name, old, new, message",
-    [
-        ("episodes.jsonl", b'{"episode": 2', b'{"episode# 2', "line 2 is invalid"),
-        ("episodes.jsonl", b'"episode": 2', b'"episode": 3', "line 2 holds episode 3 .* expected episode 2 at row 20"),
-        ("episodes.jsonl", b'"start": 20', b'"start": 21', "expected episode 2 at row 20"),
-        ("episodes.jsonl", b'"length": 22', b'"length": 99', "damaged: .* bytes, the index needs"),
-        ("meta.json", b'"version": 1', b'"version": 3', "format version 3, this code reads 1 and 2"),
-        ("meta.json", b'"shapes"', b'"shape"', "has a missing or invalid field 'shapes'"),
-    ],
-)
-def test_a_damaged_text_file_is_reported(record, name, old, new, message):
-    path = record([20, 21, 22])
-    edit(path / name, old, new)
-    with pytest.raises(ValueError, match=message):
-        EpisodeStore.open(path)
 
 
 @pytest.mark.parametrize("key", ["pixels", "action", "state"])
@@ -54,18 +23,14 @@ def test_a_damaged_data_file_is_reported(record, key):
         file.write_bytes(damaged)
         with pytest.raises(ValueError, match=f"bytes of episode {episode} do not match"):
             EpisodeStore.open(path, verify="full")
-        if episode == 2:
-            EpisodeStore.open(path, verify="ends")  # cheap, and says so
-        else:
+        if episode != 2:  # the default is cheap: it looks at both ends
             with pytest.raises(ValueError, match=f"bytes of episode {episode} do not match"):
                 EpisodeStore.open(path)
-        EpisodeStore.open(path, verify="none")
-    file.write_bytes(whole[:-1])
-    with pytest.raises(ValueError, match=f"{key}.memmap is damaged"):
-        EpisodeStore.open(path, verify="none")
-    file.unlink()
-    with pytest.raises(ValueError, match=f"{key}.memmap is damaged"):
-        EpisodeStore.open(path, verify="none")
+        EpisodeStore.open(path, verify="none" if episode != 2 else "ends")
+    for break_it in (lambda: file.write_bytes(whole[:-1]), file.unlink):
+        break_it()
+        with pytest.raises(ValueError, match=f"{key}.memmap is damaged"):
+            EpisodeStore.open(path, verify="none")
 
 
 def test_absent_and_incomplete_datasets_name_the_command(record, tmp_path):

@@ -10,7 +10,6 @@ import pytest
 
 from torchrl_ficreg.data import check_episode
 from torchrl_ficreg.envs import collect_episodes, ENVIRONMENTS
-from torchrl_ficreg.envs._gl import gl_works
 
 SMALL = {"image_size": 16, "max_steps": 12}
 
@@ -32,23 +31,18 @@ def test_episodes_keep_the_key_contract_and_stop_at_success_or_after_max_steps(r
 
 
 @pytest.mark.parametrize("name", sorted(ENVIRONMENTS))
-def test_each_action_leads_from_its_own_frame_to_the_next(name):
+def test_each_action_leads_from_its_own_frame_to_the_next(build, name):
     """Replaying the recorded actions gives the recorded states bit for bit, and the states give the pictures."""
-    if name in ("reacher", "cube"):
-        pytest.importorskip("dm_control" if name == "reacher" else "ogbench")
-        if not gl_works():
-            pytest.skip("no GL here: apt-get install libegl1 libgl1")
     env_kwargs = {"stop_within_action": False} if name == "reacher" else {}
+    env = build(name, **env_kwargs)
     settings = {"image_size": 16, "max_steps": 12, "stop_at_success": False, "env_kwargs": env_kwargs}
     (episode,) = collect_episodes(name, 1, seed=3, num_workers=0, **settings)
     assert check_episode(episode) == 13 and not episode["action"][-1].any()
-    env = ENVIRONMENTS[name].load_env()(image_size=16, **env_kwargs)
     observation, _ = env.reset(options={"state": episode["state"][0]})
     for t, action in enumerate(episode["action"]):
         for key in ("pixels", "state"):
             assert observation[key].tobytes() == episode[key][t].tobytes(), (t, key)
         observation = env.step(action)[0]
-    env.close()
 
 
 def test_the_number_of_workers_does_not_change_a_byte_and_stopping_early_leaves_no_process():

@@ -92,19 +92,14 @@ def test_any_number_of_tasks_records_the_same_dataset(ray, fingerprint, tmp_path
 
 
 def test_finished_shards_are_skipped_and_others_continued(ray, fingerprint, tmp_path):
+    """Also those killed before their first index line, and those written before shards noted their numbers."""
     folder = record(tmp_path)
     ray.executed.clear()
     assert record(tmp_path, num_tasks=5) == folder and not ray.executed
     drop_last_episode(folder / "shard-1")
     shutil.rmtree(folder / "shard-2")
     record(tmp_path, num_tasks=5)  # the number of shards stays
-    assert ray.executed == ["shard-1", "shard-2"]
-    assert open_store(folder).fingerprint == fingerprint
-
-
-def test_shards_without_an_episode_or_a_number_are_continued(ray, fingerprint, tmp_path):
-    """Killed before the first index line; and as written before shards noted their numbers."""
-    folder = record(tmp_path)
+    assert ray.executed == ["shard-1", "shard-2"] and open_store(folder).fingerprint == fingerprint
     for shard in shard_paths(folder):
         for file in (*shard.glob("*.memmap"), shard / "episodes.jsonl"):
             file.write_bytes(b"")
@@ -120,8 +115,7 @@ def test_a_task_that_fails_is_one_line_and_cancels_the_rest(ray, tmp_path):
     ray.failing = "shard-1"
     with pytest.raises(RuntimeError, match=r"shard-1 failed \(OSError: disk full\): the episodes before are kept") as caught:
         record(tmp_path)
-    assert "\n" not in str(caught.value)
-    assert ray.cancelled == ["shard-2"] and not ray.running
+    assert "\n" not in str(caught.value) and ray.cancelled == ["shard-2"] and not ray.running
     ray.failing = None
     assert open_store(record(tmp_path)).num_episodes == COUNT
 

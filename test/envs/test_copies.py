@@ -8,9 +8,9 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from simulators import assert_same
 
 from torchrl_ficreg.envs import ENVIRONMENTS, make_env
-from torchrl_ficreg.envs._gl import gl_works
 
 COPIERS = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 SETTINGS = {"push_t": [{}, {"legacy_restore": True}]}
@@ -18,26 +18,10 @@ SETTINGS = {"push_t": [{}, {"legacy_restore": True}]}
 CONTACT = {"push_t": [190.0, 300.0, 256.0, 300.0, 0.5, 0.0, 0.0]}
 
 
-def build(name, **kwargs):
-    if name in ("reacher", "cube"):
-        pytest.importorskip("mujoco")
-        if not gl_works():
-            pytest.skip("no GL")
-    return ENVIRONMENTS[name].load_env()(image_size=16, **kwargs)
-
-
-def assert_same(first, second):
-    assert first.keys() == second.keys()
-    for key in first:
-        assert np.array_equal(first[key], second[key]), key
-
-
 @pytest.mark.parametrize("copier", COPIERS)
 @pytest.mark.parametrize("steps", [None, 0, 7])
-@pytest.mark.parametrize(
-    ("name", "kwargs"), [(name, kwargs) for name in ENVIRONMENTS for kwargs in SETTINGS.get(name, [{}])]
-)
-def test_a_copy_steps_and_draws_like_the_original(name, kwargs, steps, copier):
+@pytest.mark.parametrize(("name", "kwargs"), [(name, kwargs) for name in ENVIRONMENTS for kwargs in SETTINGS.get(name, [{}])])
+def test_a_copy_steps_and_draws_like_the_original(build, name, kwargs, steps, copier):
     """Before the first reset, after it, and in the middle of an episode; neither moves the other."""
     env = build(name, **kwargs)
     env.action_space.seed(0)
@@ -49,12 +33,10 @@ def test_a_copy_steps_and_draws_like_the_original(name, kwargs, steps, copier):
     if steps is None:
         assert_same(env.reset(seed=5)[0], twin.reset(seed=5)[0])
     actions = [env.action_space.sample() for _ in range(4)]
-    ours = [env.step(action)[0] for action in actions]
-    theirs = [twin.step(action)[0] for action in actions]
+    ours, theirs = ([one.step(action)[0] for action in actions] for one in (env, twin))
     for first, second in zip(ours, theirs):
         assert_same(first, second)
     assert_same(env.reset()[0], twin.reset()[0])  # the generators are copied too
-    env.close()
     twin.close()
 
 
@@ -69,9 +51,9 @@ def test_a_torchrl_environment_is_copied_with_its_wrappers(num_envs):
     assert all(torch.equal(ours[key], theirs[key]) for key in ("state", "pixels", "success"))
 
 
-def test_the_journal_of_a_scene_that_is_never_restored_is_bounded(monkeypatch):
+def test_the_journal_of_a_scene_that_is_never_restored_is_bounded(build, monkeypatch):
+    env = build("push_t")
     monkeypatch.setattr("torchrl_ficreg.envs.push_t.physics.MOST_CALLS", 20)
-    env = ENVIRONMENTS["push_t"].load_env()(image_size=8)
     env.reset(seed=0)
     for _ in range(50):
         env.step(np.zeros(2))
@@ -80,5 +62,4 @@ def test_the_journal_of_a_scene_that_is_never_restored_is_bounded(monkeypatch):
         with pytest.raises(RuntimeError, match="more than 20 times since its last set_state.* reset it first"):
             copier(env)
     env.reset()
-    twin = copy.deepcopy(env)
-    assert_same(env.step(np.ones(2))[0], twin.step(np.ones(2))[0])
+    assert_same(copy.deepcopy(env).step(np.ones(2))[0], env.step(np.ones(2))[0])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -11,6 +13,7 @@ import time
 import pytest
 import torch
 
+from torchrl_ficreg.envs import _workers
 from torchrl_ficreg.envs._workers import ordered_map, WorkerPool
 
 
@@ -61,9 +64,18 @@ def wait_until(condition, seconds=20.0):
     return condition()
 
 
+@contextlib.contextmanager
+def spawned():
+    """Worker processes start as they do outside of tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_workers, "multiprocessing", multiprocessing)
+        yield
+
+
 @pytest.fixture(scope="module")
 def counters():
-    pool = WorkerPool(Counter, 2)
+    with spawned():
+        pool = WorkerPool(Counter, 2)
     yield pool
     pool.close()
 
@@ -86,15 +98,24 @@ def test_exceptions_are_raised_with_their_messages_and_the_object_remains(counte
     assert counters.call("add", {0: (1,)}) == {0: before + 1}
 
 
-def test_a_worker_has_one_thread_and_the_parent_keeps_its_environment(counters):
+def test_a_worker_has_one_thread_and_ignores_sigint_and_the_parent_keeps_its_environment(counters):
+    for pid in counters.pids:
+        os.kill(pid, signal.SIGINT)
     assert counters.call("threads", {0: (), 1: ()}) == {0: (1, "1", "0"), 1: (1, "1", "0")}
     assert "LP_NUM_THREADS" not in os.environ or os.environ["LP_NUM_THREADS"] != "0"
 
 
-def test_workers_ignore_sigint(counters):
-    for pid in counters.pids:
-        os.kill(pid, signal.SIGINT)
-    assert len(counters.call("add", {0: (0,), 1: (0,)})) == 2
+def test_a_stopped_worker_causes_a_warning_and_then_an_error(counters, monkeypatch):
+    """A stopped process sends nothing and does not end: only the timeout finds it, and closes the pool."""
+    monkeypatch.setattr(_workers, "_JOIN_SECONDS", 0.2)
+    assert len(counters.call("add", {0: (1,), 1: (1,)})) == 2
+    counters._warn_after, counters._timeout, pids = 0.2, 1.0, counters.pids
+    os.kill(pids[1], signal.SIGSTOP)
+    with pytest.warns(UserWarning, match=f"worker process 2 of 2.*{pids[1]}.*has not answered for 0 s"):
+        with pytest.raises(TimeoutError, match="has not answered for 1 s: look whether it is stopped"):
+            counters.call("add", {0: (1,), 1: (1,)})
+    assert counters.closed
+    assert wait_until(lambda: all(map(gone, pids)))
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
@@ -115,23 +136,7 @@ if __name__ == "__main__":
     )
     assert outcome.returncode == -signal.SIGKILL, outcome.stderr
     pids = [int(word) for word in outcome.stdout.split()]
-    assert len(pids) == 1
-    assert wait_until(lambda: all(map(gone, pids)))
-
-
-def test_a_stopped_worker_causes_a_warning_and_then_an_error(monkeypatch):
-    """A stopped process sends nothing and does not end: only the timeout finds it."""
-    monkeypatch.setattr("torchrl_ficreg.envs._workers._JOIN_SECONDS", 0.2)
-    pool = WorkerPool(Counter, 2, warn_after=0.2, timeout=600.0)
-    assert pool.call("add", {0: (1,), 1: (1,)}) == {0: 1, 1: 1}
-    pool._timeout = 1.0
-    os.kill(pool.pids[1], signal.SIGSTOP)
-    pids = pool.pids
-    with pytest.warns(UserWarning, match=f"worker process 2 of 2.*{pids[1]}.*has not answered for 0 s"):
-        with pytest.raises(TimeoutError, match="has not answered for 1 s: look whether it is stopped"):
-            pool.call("add", {0: (1,), 1: (1,)})
-    assert pool.closed
-    assert wait_until(lambda: all(map(gone, pids)))
+    assert len(pids) == 1 and wait_until(lambda: all(map(gone, pids)))
 
 
 @pytest.fixture
@@ -151,13 +156,10 @@ def few_handles():
 
 @pytest.mark.parametrize("left", [1, 3, 8])
 def test_a_lack_of_file_handles_is_reported_as_such(few_handles, monkeypatch, left):
-    monkeypatch.setattr("torchrl_ficreg.envs._workers._JOIN_SECONDS", 0.1)
+    monkeypatch.setattr(_workers, "_JOIN_SECONDS", 0.1)
     few_handles(left)
-    with pytest.raises(RuntimeError, match="too many open files to run the worker processes: raise the limit"):
+    with spawned(), pytest.raises(RuntimeError, match="too many open files to run the worker processes: raise the limit"):
         WorkerPool(Counter, 4)
-
-
-# ---------------------------------------------------------------------- ordered_map
 
 
 def slow_first_and_fails_at_50(item):
@@ -183,14 +185,14 @@ def test_results_keep_the_order_of_the_items_which_are_drawn_only_as_needed():
             yield item
 
     results = ordered_map(slow_first_and_fails_at_50, items(), num_workers=2)
-    assert next(results) == 0
+    with spawned():
+        assert next(results) == 0
     assert len(drawn) <= 4
     assert [next(results) for _ in range(49)] == list(range(1, 50))
     with pytest.raises(ValueError, match="50 is too large") as caught:
         next(results)
     cause = str(caught.value.__cause__)
-    assert "at item 50" in cause and "in slow_first_and_fails_at_50" in cause
-    assert len(drawn) <= 54
+    assert "at item 50" in cause and "in slow_first_and_fails_at_50" in cause and len(drawn) <= 54
 
 
 def test_a_worker_that_dies_ends_the_map():

@@ -10,14 +10,16 @@ from torchrl_ficreg import GoalDistance, GoalPolicy
 from torchrl_ficreg.data import ActionStatistics
 from torchrl_ficreg.planners import SEARCHES
 
+QUARTER = ([-0.25, -0.25], [0.25, 0.25])
+FOREIGN = "cannot come from actions between .* another environment"
+
 
 def test_without_bounds_a_plan_goes_beyond(linear_world):
     search = {"num_candidates": 64, "num_elites": 8, "iterations": 20, "bounds": "none"}
     planner = make_planner("cem", linear_world(), action_bounds=None, **search)
     assert planner.block_bounds() is None
     result = planner.plan(torch.zeros(1, 2), torch.tensor([[10.0, 0.0]]))
-    assert result["plan"].max() > 1.0
-    assert result["plan_cost"].item() < 1.0
+    assert result["plan"].max() > 1.0 and result["plan_cost"].item() < 1.0
 
 
 def test_bounds_are_z_scored_in_every_dimension_of_every_sub_step(linear_world):
@@ -36,30 +38,20 @@ def test_a_mean_action_outside_the_bounds_is_not_planned(linear_world):
 
 
 @pytest.mark.parametrize(
-    ("bounds", "message"),
+    ("bounds", "mean", "std", "message"),
     [
-        (None, r"needs action_bounds=\(low, high\) in environment units, or bounds='none'"),
-        (([-1.0], [1.0]), r"of shape \[2\].*another environment"),
-        (([-1.0, 1.0], [1.0, -1.0]), "low <= high"),
+        (None, (0.0, 0.0), (1.0, 1.0), r"needs action_bounds=\(low, high\) in environment units, or bounds='none'"),
+        (([-1.0], [1.0]), (0.0, 0.0), (1.0, 1.0), r"of shape \[2\].*another environment"),
+        (([-1.0, 1.0], [1.0, -1.0]), (0.0, 0.0), (1.0, 1.0), "low <= high"),
+        (UNIT, (2.0, 0.0), (0.5, 0.5), FOREIGN),  # no actions between -1 and 1 have a mean of 2
+        (UNIT, (0.0, 0.0), (0.5, 1.5), FOREIGN),  # nor a std above 1
+        (QUARTER, (0.0, 2.0), (0.1, 1.0), FOREIGN),  # nor is a constant outside the bounds
+        (QUARTER, (0.0, -0.3), (0.1, 1.0), FOREIGN),
     ],
 )
-def test_impossible_bounds_are_refused(linear_world, bounds, message):
+def test_bounds_that_are_impossible_or_contradict_the_statistics_are_refused(linear_world, bounds, mean, std, message):
     with pytest.raises(ValueError, match=message):
-        make_planner("cem", linear_world(), action_bounds=bounds)
-
-
-@pytest.mark.parametrize(
-    ("mean", "std", "bound"),
-    [
-        ((2.0, 0.0), (0.5, 0.5), 1.0),  # no actions between -1 and 1 have a mean of 2
-        ((0.0, 0.0), (0.5, 1.5), 1.0),  # nor a std above 1
-        ((0.0, 2.0), (0.1, 1.0), 0.25),  # nor is a constant outside the bounds
-        ((0.0, -0.3), (0.1, 1.0), 0.25),
-    ],
-)
-def test_statistics_that_cannot_come_from_the_bounds_are_refused(linear_world, mean, std, bound):
-    with pytest.raises(ValueError, match="cannot come from actions between .* another environment"):
-        make_planner("cem", linear_world(2, mean, std), action_bounds=([-bound] * 2, [bound] * 2))
+        make_planner("cem", linear_world(2, mean, std), action_bounds=bounds)
 
 
 @pytest.mark.parametrize("search", SEARCHES)

@@ -1,11 +1,9 @@
-"""Claims about the latent CEM planner beside those about all searches: its mean, its seeds, and its place in TorchRL."""
+"""The latent CEM planner, beside what holds for all searches: its mean, its seeds, and a search of one's own."""
 
 from __future__ import annotations
 
 import torch
 from making import make_planner
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
 
 from torchrl_ficreg import CEMConfig, GoalDistance
 from torchrl_ficreg.planners import SamplingPlanner
@@ -42,16 +40,3 @@ def test_a_users_own_search_defines_one_update(linear_world):
 
     planner = BestOnly(linear_world(), CEMConfig(num_candidates=64, num_elites=2, horizon=3, receding_horizon=1, bounds="none"))
     assert planner.plan(torch.zeros(1, 2), torch.tensor([[3.0, -1.0]]))["plan_cost"].item() < 0.05
-
-
-def test_it_is_a_tensordict_module(linear_world):
-    planner = make_planner("cem", linear_world())
-    assert isinstance(planner, TensorDictModuleBase)
-    td = TensorDict({"latent": torch.randn(2, 2), "goal_latent": torch.randn(2, 2), "other": torch.ones(2)}, [2])
-    td["plan_seed"] = torch.tensor([5, 6])
-    expected = planner.plan(td["latent"], td["goal_latent"], td["plan_seed"])
-    assert planner(td) is td
-    assert set(td.keys()) == {"latent", "goal_latent", "other", "plan_seed", "plan", "plan_cost", "action"}
-    assert td["plan"].equal(expected["plan"]) and td["action"].equal(expected["plan"][:, 0])
-    assert planner.out_keys == ["action", "plan", "plan_cost"]
-    assert len(planner.state_dict()) == len(planner.world_model.state_dict())  # the model once

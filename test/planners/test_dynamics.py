@@ -28,35 +28,18 @@ SEARCH = {"num_candidates": 32, "num_elites": 6, "iterations": 5}
 
 
 def snapshot(world):
-    return {name: (id(value), value.dtype, value.detach().clone()) for name, value in tensors(world)}
-
-
-def tensors(world):
-    return [*world.named_parameters(), *world.named_buffers()]
-
-
-def unchanged(world, before):
-    now = dict(tensors(world))
-    return set(now) == set(before) and all(
-        id(value) == before[name][0] and value.dtype == before[name][1] and value.equal(before[name][2])
-        for name, value in now.items()
-    )
-
-
-@pytest.mark.parametrize("precision", ["fp32", "bf16"])
-def test_planning_changes_nothing_in_the_world_model(tiny_world, precision):
-    """Not a bit, not a dtype, not even which objects its parameters are."""
-    world = tiny_world()
-    before = snapshot(world)
-    make_planner("cem", world, **SEARCH | {"precision": precision}).plan(*torch.randn(2, 2, 6))
-    assert unchanged(world, before)
-    assert all(param.requires_grad and param.grad is None for param in world.parameters())
+    """Name, identity, dtype and bytes of every parameter and buffer."""
+    tensors = [*world.named_parameters(), *world.named_buffers()]
+    return [(name, id(value), value.dtype, value.detach().numpy().tobytes()) for name, value in tensors]
 
 
 @pytest.mark.parametrize("error", [ValueError("no such goal"), KeyboardInterrupt(), torch.OutOfMemoryError("full")])
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
-def test_nor_does_an_error_or_an_interruption_of_the_search(tiny_world, precision, error):
-    """The next plan is that of a planner without an error before it."""
+def test_planning_changes_nothing_in_the_world_model(tiny_world, precision, error):
+    """Not a bit, not a dtype, not even which objects its parameters are; nor does an error or an interruption of the search.
+
+    The next plan is that of a planner without an error before it.
+    """
     world, (latent, goal), calls = tiny_world(), torch.randn(2, 2, 6), []
 
     def cost(predicted, goal):
@@ -67,10 +50,11 @@ def test_nor_does_an_error_or_an_interruption_of_the_search(tiny_world, precisio
 
     before = snapshot(world)
     expected = make_planner("cem", world, **SEARCH | {"precision": precision}).plan(latent, goal)["plan"]
+    assert snapshot(world) == before
     planner = make_planner("cem", world, cost=cost, **SEARCH | {"precision": precision})
     with pytest.raises(type(error)):
         planner.plan(latent, goal)
-    assert unchanged(world, before)
+    assert snapshot(world) == before and all(param.requires_grad and param.grad is None for param in world.parameters())
     assert planner.plan(latent, goal)["plan"].equal(expected)
 
 
@@ -83,19 +67,6 @@ def test_weights_trained_further_are_planned_with(tiny_world):
         for param in world.predictor.parameters():
             param.mul_(1.5)
     assert not planner.plan(latent, goal)["plan_cost"].equal(before)
-
-
-def test_both_precisions_find_the_same_optimum(linear_world):
-    goal = torch.tensor([[2.0, -1.0], [10.0, 0.0]])
-    results = [
-        make_planner("cem", linear_world(), **{**SEARCH, "iterations": 12, "precision": precision}).plan(torch.zeros(2, 2), goal)
-        for precision in ("fp32", "bf16")
-    ]
-    ways = [result["plan"].unflatten(-1, (-1, 2)).sum((1, 2)) for result in results]
-    torch.testing.assert_close(ways[0], torch.tensor([[2.0, -1.0], [6.0, 0.0]]), rtol=0, atol=0.2)
-    torch.testing.assert_close(ways[1], ways[0], rtol=0, atol=0.2)
-    assert results[1]["plan"].dtype == results[1]["plan_cost"].dtype == torch.float32
-    assert not results[1]["plan_cost"].equal(results[0]["plan_cost"])
 
 
 # A user's own predictor

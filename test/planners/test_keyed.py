@@ -6,6 +6,7 @@ import pytest
 import torch
 from making import make_planner, SEARCHING
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import InitTracker, RenameTransform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules.planners import CEMPlanner
@@ -27,11 +28,16 @@ PLANNER_KEYS = {
 
 @pytest.mark.parametrize("search", SEARCHING)
 def test_a_planner_plans_the_same_under_other_keys(tiny_world, search):
-    """Nested ones included, with a context and seeds; its in_keys and out_keys follow."""
+    """Nested ones included, with a context and seeds; its in_keys and out_keys follow. Foreign entries are left alone."""
     planner, context = make_planner(search, tiny_world(), trace=True), torch.randn(2, 3, 6)
     inputs = {"latent": context, "goal_latent": torch.randn(2, 6), "past_action": torch.randn(2, 2, 4)}
     inputs["plan_seed"] = torch.tensor([7, 3])
-    expected = planner(TensorDict(inputs, [2]))
+    expected = TensorDict({**inputs, "other": torch.ones(2)}, [2])
+    assert isinstance(planner, TensorDictModuleBase) and planner(expected) is expected
+    assert set(expected.keys()) == {*inputs, "other", *planner.out_keys}
+    plan = planner.plan(*(inputs[name] for name in ("latent", "goal_latent", "plan_seed")), past_action=inputs["past_action"])
+    assert plan["plan"].equal(expected["plan"]) and plan["plan"][:, 0].equal(expected["action"])
+    assert len(planner.state_dict()) == len(planner.world_model.state_dict())  # the model once
     planner.set_keys(**PLANNER_KEYS)
     assert planner.in_keys == [("seen", "z"), ("wanted", "z")]
     assert planner.out_keys == [("out", "block"), ("out", "plan"), ("out", "cost"), "trace_of_plan"]

@@ -58,8 +58,7 @@ def test_the_best_elites_are_carried_over(linear_world, goal, share, kept):
     _, evaluated = search("icem", linear_world(), goal, kept_elites=share)
     for (before, cost), (after, _) in zip(evaluated, evaluated[1:-1]):
         best = before[cost.topk(8, largest=False).indices]
-        assert after[1 : 1 + kept].equal(best[:kept])
-        assert not after[1 + kept].equal(best[kept % 8])
+        assert after[1 : 1 + kept].equal(best[:kept]) and not after[1 + kept].equal(best[kept % 8])
     if kept:
         lowest = torch.stack([cost.min() for _, cost in evaluated])
         assert (lowest.diff() <= 0).all()
@@ -67,9 +66,7 @@ def test_the_best_elites_are_carried_over(linear_world, goal, share, kept):
 
 def test_all_elites_may_be_kept_where_they_are_all_there_is(linear_world, goal):
     """Candidate 0 is the mean all the same."""
-    plan, evaluated = search(
-        "icem", linear_world(), goal, num_candidates=6, num_elites=6, kept_elites=1.0, momentum=0.0
-    )
+    plan, evaluated = search("icem", linear_world(), goal, num_candidates=6, num_elites=6, kept_elites=1.0, momentum=0.0)
     for (before, _), (after, _) in zip(evaluated, evaluated[1:-1]):
         torch.testing.assert_close(after[0], before.mean(0))
     assert plan.isfinite().all()
@@ -102,17 +99,13 @@ def test_coloured_noise_has_unit_variance_at_every_time_and_the_stated_spectrum(
     torch.testing.assert_close(power / power[1], frequency**-beta, rtol=0.05, atol=1e-5)
 
 
-def test_a_beta_of_zero_and_a_single_time_leave_it_white():
-    white = torch.randn(5, 6, 7)
-    assert coloured(white, 0.0, dim=1).equal(white)
-    assert coloured(white[:, :1], 2.0, dim=1).equal(white[:, :1])
-
-
 @pytest.mark.parametrize("dim", [0, 1, 2, -1, -2, -3])
-def test_time_may_be_any_dimension(dim):
+def test_time_may_be_any_dimension_and_a_beta_of_zero_or_a_single_time_leave_it_white(dim):
     white = torch.randn(4, 5, 6)
     moved = coloured(white.movedim(dim, -1), 2.0, dim=-1).movedim(-1, dim)
     torch.testing.assert_close(coloured(white, 2.0, dim=dim), moved)
+    single = white.narrow(dim, 0, 1)
+    assert coloured(white, 0.0, dim=dim).equal(white) and coloured(single, 2.0, dim=dim).equal(single)
 
 
 def test_noise_runs_on_across_the_borders_of_blocks(linear_world):
@@ -122,32 +115,21 @@ def test_noise_runs_on_across_the_borders_of_blocks(linear_world):
     raw = evaluated[0][0][1:].unflatten(-1, (3, 2)).flatten(1, 2)  # [K - 1, H * F, A]
     correlation = (raw[:, 1:] * raw[:, :-1]).mean(0)  # [H * F - 1, A], borders after 2 and 5
     torch.testing.assert_close(correlation, correlation.mean().expand_as(correlation), rtol=0, atol=0.05)
-    assert correlation.mean() > 0.5
-    assert (raw[..., 0] * raw[..., 1]).mean().abs() < 0.05
+    assert correlation.mean() > 0.5 and (raw[..., 0] * raw[..., 1]).mean().abs() < 0.05
     torch.testing.assert_close(raw.var(0), torch.ones(9, 2), rtol=0.06, atol=0)
 
 
 # MPPI
 
 
-def test_at_a_temperature_near_zero_the_best_candidate_is_taken(linear_world, goal):
-    plan, evaluated = search("mppi", linear_world(), goal, temperature=1e-6)
-    candidates, cost = evaluated[-2]
-    torch.testing.assert_close(plan, candidates[cost.argmin()])
-
-
-def test_at_a_high_temperature_all_elites_count_the_same(linear_world, goal):
-    plan, evaluated = search("mppi", linear_world(), goal, temperature=1e6)
-    candidates, cost = evaluated[-2]
-    torch.testing.assert_close(plan, candidates[cost.topk(8, largest=False).indices].mean(0), rtol=1e-3, atol=1e-4)
-
-
-def test_its_weights_are_a_softmax_over_the_standardised_costs_of_the_elites(linear_world, goal):
-    plan, evaluated = search("mppi", linear_world(), goal, iterations=1, temperature=0.7)
+@pytest.mark.parametrize("temperature", [1e-6, 0.7, 1e6])
+def test_its_weights_are_a_softmax_over_the_standardised_costs_of_the_elites(linear_world, goal, temperature):
+    """Near zero the best candidate is taken, at a high temperature all elites count the same."""
+    plan, evaluated = search("mppi", linear_world(), goal, iterations=1, temperature=temperature)
     candidates, cost = evaluated[0]
     lowest, rows = cost.topk(8, largest=False)
-    weight = torch.exp(-lowest / (0.7 * lowest.std()))
-    torch.testing.assert_close(plan, (weight / weight.sum() @ candidates[rows].flatten(1)).view_as(plan))
+    weight = torch.softmax(-lowest / (temperature * lowest.std()), 0)
+    torch.testing.assert_close(plan, (weight @ candidates[rows].flatten(1)).view_as(plan))
 
 
 @pytest.mark.parametrize("temperature", [0.5, 1e-12])

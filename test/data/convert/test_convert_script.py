@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
@@ -30,11 +29,11 @@ def execute(tmp_path):
         sys.path.insert(0, str(SCRIPT.parent))
         runpy.run_path(str(SCRIPT), run_name="__main__")
 
-    def execute(*overrides):
+    def execute(*overrides, code=0):
         process = multiprocessing.get_context("fork").Process(target=work, args=(overrides,))
         process.start()
         process.join(120)
-        assert process.exitcode == 0, (tmp_path / ".stderr").read_text()
+        assert process.exitcode == code, (tmp_path / ".stderr").read_text()
         return (tmp_path / ".stdout").read_text(), (tmp_path / ".stderr").read_text()
 
     return execute
@@ -57,11 +56,8 @@ def test_other_data_name_their_columns(tmp_path, execute, make_rows):
     assert store.header.shapes["state"] == (2,) and store.header.meta["action_low"] == [-2, -2]
 
 
-def test_a_mistake_ends_in_one_line_and_nothing_on_disk(tmp_path, make_rows):
+def test_a_mistake_ends_in_one_line_and_nothing_on_disk(tmp_path, execute, make_rows):
     write_lewm(tmp_path / "two.h5", make_rows([30] * 6))
-    line = [sys.executable, str(SCRIPT), "source=two.h5", "target=out", "env=reacher"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 1 and "has no number column for reacher's state" in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    _, error = execute("source=two.h5", "target=out", "env=reacher", code=1)
+    assert "has no number column for reacher's state" in error and len(error.strip().splitlines()) == 1
     assert not (tmp_path / "out").exists()

@@ -74,8 +74,7 @@ def test_the_gripper_stays_in_its_workspace(arm, start):
     for sign in (1, -1):
         travel(arm, start, [3 * sign, 3 * sign, 3 * sign, 0, 0], 40)
         low, high = np.array([[0.25, -0.35, 0.02], [0.6, 0.35, 0.35]])
-        assert (gripper(arm) > low - 0.005).all()
-        assert (gripper(arm) < high + 0.005).all()
+        assert (gripper(arm) > low - 0.005).all() and (gripper(arm) < high + 0.005).all()
 
 
 def test_a_zero_action_targets_the_measured_pose(arm, start):
@@ -86,15 +85,15 @@ def test_a_zero_action_targets_the_measured_pose(arm, start):
     assert np.abs(previous_targets - joints).max() > 0.15
     np.testing.assert_allclose(arm.ogbench.data.ctrl[:6], joints, atol=0.04)
     sag = travel(arm, start, [0, 0, 0, 0, 0], 20)
-    assert -0.05 < sag[2] < -0.01
-    assert np.abs(sag[:2]).max() < 0.01
+    assert -0.05 < sag[2] < -0.01 and np.abs(sag[:2]).max() < 0.01
 
 
-def test_the_last_number_closes_the_gripper(arm, start):
+def test_the_last_number_closes_the_gripper_and_a_resting_cube_rests(arm, start):
     travel(arm, start, [0, 0, 0, 0, 1], 10)
     assert arm.measure(arm.state)["proprio/gripper_opening"].item() > 0.9
     travel(arm, arm.state, [0, 0, 0, 0, -1], 10)
     assert arm.measure(arm.state)["proprio/gripper_opening"].item() < 0.1
+    assert np.abs(arm.state[CUBE_POSITION] - start[CUBE_POSITION]).max() < 1e-3
 
 
 def test_measuring_does_not_change_the_simulation(arm, start):
@@ -105,8 +104,7 @@ def test_measuring_does_not_change_the_simulation(arm, start):
     moved = arm.state
     arm.measure(start)
     sample_start(np.random.default_rng(0), arm)
-    assert arm.state.tobytes() == moved.tobytes()
-    assert start.tobytes() == copy.tobytes()
+    assert arm.state.tobytes() == moved.tobytes() and start.tobytes() == copy.tobytes()
 
 
 def test_starts_cover_the_published_ranges(arm):
@@ -118,24 +116,16 @@ def test_starts_cover_the_published_ranges(arm):
         position = states[:, CUBE_POSITION]
         np.testing.assert_allclose(position.min(0), [0.3, -0.3, 0.02], atol=0.02)
         np.testing.assert_allclose(position.max(0), [0.55, 0.3, 0.02], atol=0.02)
-        assert (position[:, :2] >= [0.3, -0.3]).all()
-        assert (position[:, :2] <= [0.55, 0.3]).all()
+        assert (position[:, :2] >= [0.3, -0.3]).all() and (position[:, :2] <= [0.55, 0.3]).all()
         assert states[:, CUBE_ROTATION][:, 0].min() < -0.9  # yaws reach 2 pi
-        assert not states[:, GRIPPER].any()
-        assert not states[:, 21:].any()
+        assert not states[:, GRIPPER].any() and not states[:, 21:].any()
     seen = [arm.measure(state) for state in starts]
     positions = np.stack([one["proprio/effector_pos"] for one in seen])
     np.testing.assert_allclose(positions, np.broadcast_to([0.425, 0, 0.275], positions.shape), atol=2e-4)
     yaws = np.array([one["proprio/effector_yaw"].item() for one in seen])
-    assert yaws.min() < -2.8
-    assert yaws.max() > 2.8
+    assert yaws.min() < -2.8 and yaws.max() > 2.8
     after = [arm.measure(goal)["proprio/effector_yaw"].item() for goal in goals]
     np.testing.assert_allclose(np.cos(after - yaws), 1, atol=1e-6)  # the goal's arm is turned as the start's
-
-
-def test_a_resting_cube_rests(arm, start):
-    travel(arm, start, [0, 0, 0, 0, 0], 20)
-    assert np.abs(arm.state[CUBE_POSITION] - start[CUBE_POSITION]).max() < 1e-3
 
 
 def test_a_process_compiles_once(monkeypatch):
@@ -144,13 +134,10 @@ def test_a_process_compiles_once(monkeypatch):
 
     calls = []
     stock_compile = StockEnv.compile_model_and_data
-    monkeypatch.setattr(
-        StockEnv, "compile_model_and_data", lambda self: (calls.append(self), stock_compile(self))
-    )
+    monkeypatch.setattr(StockEnv, "compile_model_and_data", lambda self: (calls.append(self), stock_compile(self)))
     arm_module.compiled.cache_clear()
     arms = [CubeArm() for _ in range(3)]
     for one in arms:
         one.restore(sample_start(np.random.default_rng(0), one))
         one.step(np.ones(5))
-    assert len(calls) == 1
-    assert arms[0].model is arms[2].model
+    assert len(calls) == 1 and arms[0].model is arms[2].model

@@ -1,13 +1,9 @@
-"""PushT as an environment: contracts, draws, goals, restoration and what its pictures show."""
+"""What PushTEnv adds to the protocol of all environments: draws, success rules, and restoration of contacts."""
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
-
 pytest.importorskip("pymunk", reason="PushT needs pymunk")
 
 from torchrl_ficreg.envs.push_t import tasks  # noqa: E402
@@ -17,43 +13,21 @@ from torchrl_ficreg.envs.push_t.render import render_pixels  # noqa: E402
 START = np.array([100.0, 100.0, 300.0, 260.0, 0.1, 0.0, 0.0])
 
 
-def contact_actions(count=50):
-    rng = np.random.default_rng(0)
-    return (rng.normal(0, 0.4, (count, 2)) + 0.6 * np.sin(np.arange(count) / 6)[:, None]).astype(np.float32)
-
-
-def play(env, actions, **options):
-    observations = [env.reset(options=options)[0]]
-    observations += [env.step(action)[0] for action in actions]
-    return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
-
-
-# ---------------------------------------------------------------------- contracts
-
-
-@pytest.mark.parametrize("kwargs", [{"success_on": "block", "draw_goal": False}, {"legacy_restore": True}])
-def test_gymnasium_accepts_it_with_other_settings(kwargs):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*Not able to test alternative render modes.*")
-        check_env(PushTEnv(image_size=32, **kwargs))
-
-
-# ---------------------------------------------------------------------- restoration and pictures
-
-
 def test_a_restored_contact_continues_within_a_few_pixels():
     """The solver's cached contacts are not part of the published state: the disc repeats exactly, the block nearly."""
     env = PushTEnv(image_size=8, terminate_on_success=False)
-    actions = contact_actions()
-    record = play(env, actions, state=np.array([200.0, 190.0, 250.0, 250.0, 1.0, 20.0, -30.0]))["state"]
-    apart = []
+    actions = np.random.default_rng(0).normal(0, 0.4, (50, 2)) + 0.6 * np.sin(np.arange(50) / 6)[:, None]
+
+    def play(state, actions):
+        states = [env.reset(options={"state": state})[0]["state"]]
+        return np.stack(states + [env.step(action)[0]["state"] for action in actions.astype(np.float32)])
+
+    record, apart = play(np.array([200.0, 190.0, 250.0, 250.0, 1.0, 20.0, -30.0]), actions), []
     for begin in range(0, 40, 5):
-        again = play(env, actions[begin : begin + 10], state=record[begin])["state"][-1]
+        again = play(record[begin], actions[begin : begin + 10])[-1]
         np.testing.assert_allclose(again[:2], record[begin + 10, :2], atol=1e-9)
         apart.append(np.linalg.norm(again[2:4] - record[begin + 10, 2:4]))
-    assert np.median(apart) < 1.5
-    assert max(apart) < 6
+    assert np.median(apart) < 1.5 and max(apart) < 6
 
 
 def test_legacy_restoration_steps_once_after_the_goal_and_once_after_the_start():
@@ -65,20 +39,15 @@ def test_legacy_restoration_steps_once_after_the_goal_and_once_after_the_start()
     got = [env.reset(options=options)[0] for _ in range(2)]
     np.testing.assert_allclose(got[0]["state"][:2], [61.0, 59.5], atol=1e-12)
     assert 0.1 < np.abs(got[0]["state"][2:4] - start[2:4]).max() < 5
-    assert (got[0]["state"] == got[1]["state"]).all()
-    assert (got[0]["goal_state"] == goal).all()
+    assert (got[0]["state"] == got[1]["state"]).all() and (got[0]["goal_state"] == goal).all()
     assert (got[0]["pixels"] == render_pixels(got[0]["state"], size=64)).all()
     exact, _ = PushTEnv(image_size=64).reset(options=options)
     assert (exact["state"] == start).all()
 
 
-# ---------------------------------------------------------------------- draws
-
-
 def test_starts_and_goals_fill_their_ranges_and_overlap_nothing():
     states = np.array([tasks.sample_state(np.random.default_rng(seed)) for seed in range(400)])
-    assert all(tasks.is_free(state) for state in states)
-    assert (states[:, 5:] == 0).all()
+    assert all(tasks.is_free(state) for state in states) and (states[:, 5:] == 0).all()
     for column, low, high in [(0, 50, 450), (1, 50, 450), (2, 100, 400), (3, 100, 400), (4, 0, 2 * np.pi)]:
         margin = 0.05 * (high - low)
         assert low <= states[:, column].min() < low + margin
@@ -96,9 +65,7 @@ def test_a_free_scene_does_not_move_by_itself():
 def test_published_draws_keep_overlaps():
     """14 in a hundred: 9 with the agent in the block, 5 with the block in a wall (measured over 4000 draws)."""
     rng = np.random.default_rng(0)
-    states = [tasks.sample_state(rng, legacy_draws=True) for _ in range(1000)]
-    rejected = 1 - np.mean([tasks.is_free(state) for state in states])
-    assert 0.11 < rejected < 0.17
+    assert 0.83 < np.mean([tasks.is_free(tasks.sample_state(rng, legacy_draws=True)) for _ in range(1000)]) < 0.89
 
 
 @pytest.mark.parametrize(
@@ -115,9 +82,6 @@ def test_published_draws_keep_overlaps():
 )
 def test_overlaps_are_detected_to_a_tenth_of_a_pixel(state, free):
     assert tasks.is_free(np.array([*state, 0.0, 0.0])) is free
-
-
-# ---------------------------------------------------------------------- success
 
 
 def offset(**changes):
@@ -153,49 +117,3 @@ def test_success_at_both_sides_of_its_thresholds(state, on_state, on_block):
         env = PushTEnv(image_size=8, success_on=rule)
         state[4] %= 2 * np.pi
         assert env.reset(options={"state": state, "goal_state": START})[1]["success"].tolist() == [reached]
-
-
-# ---------------------------------------------------------------------- errors
-
-
-def test_states_recorded_far_outside_the_window_are_legal():
-    """200 steps at full speed from the edge of the draws: 200 * 40.7 + 450 px."""
-    env = PushTEnv(image_size=8, terminate_on_success=False)
-    env.reset(options={"state": np.array([450.0, 450.0, 200.0, 200.0, 0.0, 0.0, 0.0])})
-    for _ in range(200):
-        observation = env.step(np.ones(2))[0]
-    assert observation["state"][0] > 8000
-    assert env.observation_space.contains(observation)
-    assert (env.reset(options={"state": observation["state"]})[0]["state"] == observation["state"]).all()
-
-
-def test_an_angle_rounded_to_float32_is_legal():
-    state = START.copy()
-    state[4] = np.nextafter(2 * np.pi, 0)
-    state = state.astype(np.float32).astype(np.float64)
-    assert state[4] > 2 * np.pi
-    assert (PushTEnv(image_size=8).reset(options={"state": state})[0]["state"] == state).all()
-
-
-@pytest.mark.parametrize(
-    ("index", "value", "reason"),
-    [
-        (4, -0.1, r"the angle, state\[4\], leaves \[0, 2 pi\): take it modulo 2 pi"),
-        (4, 6.3, r"the angle, state\[4\], leaves"),
-        (0, -10_001.0, r"a coordinate or a velocity leaves \[-10000, 10000\]"),
-        (6, 10_001.0, "a coordinate or a velocity leaves"),
-    ],
-)
-def test_illegal_states_are_refused_with_a_reason(index, value, reason):
-    state = START.copy()
-    state[index] = value
-    with pytest.raises(ValueError, match=reason):
-        PushTEnv(image_size=8).reset(options={"goal_state": state})
-
-
-def test_bad_arguments_are_refused():
-    with pytest.raises(ValueError, match=r"success_on must be one of \('state', 'block'\), got 'agent'"):
-        PushTEnv(success_on="agent")
-    env = PushTEnv(image_size=8)
-    with pytest.raises(ValueError, match=r"must have shape \(7,\), got \(5,\)"):
-        env.reset(options={"state": np.zeros(5)})

@@ -11,7 +11,7 @@ import torch
 from torchrl_ficreg.envs.push_t.render import render_pixels
 
 # Made from the published package by test/envs/push_t/golden/make_push_t.py.
-GOLDEN = Path(__file__).parent / "golden" / "push_t.npz"
+GOLDEN = np.load(Path(__file__).parent / "golden" / "push_t.npz")
 AWAY = [2000.0, 2000.0, 2000.0, 2000.0, 0.0, 0.0, 0.0]  # agent and block out of the picture
 
 
@@ -27,36 +27,24 @@ def difference(first, second):
     return np.abs(first.astype(float) - second).mean((-3, -2, -1))
 
 
-# ---------------------------------------------------------------------- against the published picture
-
-
 def test_pictures_differ_from_the_published_ones_by_less_than_half_a_grey_level():
     """0.40 over 300 scenes: 0.19 from aliased edges on whole pixels, the rest from bilinear against area resizing."""
-    golden = np.load(GOLDEN)
-    states, published = golden["state"], golden["pixels"]
-    ours = render_pixels(states, size=224)
-    assert difference(ours, published).mean() < 0.45
-    assert difference(ours, published).max() < 0.55
-    errors = np.abs(ours.astype(float) - published)
-    assert (errors > 64).mean() < 2e-3
+    ours, published = render_pixels(GOLDEN["state"], size=224), GOLDEN["pixels"]
+    assert difference(ours, published).mean() < 0.45 and difference(ours, published).max() < 0.55
+    assert (np.abs(ours.astype(float) - published) > 64).mean() < 2e-3
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2, 3])
 def test_nothing_is_displaced_against_the_published_picture(axis):
     """A pixel of the window more or less, for agent or block, makes the pictures differ more."""
-    golden = np.load(GOLDEN)
-    differences = []
-    for shift in (-1.0, 0.0, 1.0):
-        moved = golden["state"].copy()
-        moved[:, axis] += shift
-        differences.append(difference(render_pixels(moved, size=224), golden["pixels"]).mean())
-    assert np.argmin(differences) == 1
+    states, published = GOLDEN["state"], GOLDEN["pixels"]
+    shifts = [shift * np.eye(7)[axis] for shift in (-1.0, 0.0, 1.0)]
+    assert np.argmin([difference(render_pixels(states + shift, size=224), published).mean() for shift in shifts]) == 1
 
 
 def test_flat_parts_have_the_published_colours():
     """The pixels of the golden pictures whose neighbourhood is of one colour: ours have that colour too."""
-    golden = np.load(GOLDEN)
-    published, ours = golden["pixels"].astype(int), render_pixels(golden["state"], size=224).astype(int)
+    published, ours = GOLDEN["pixels"].astype(int), render_pixels(GOLDEN["state"], size=224).astype(int)
     windows = np.lib.stride_tricks.sliding_window_view(published, (5, 5), axis=(2, 3))
     flat = (np.ptp(windows, axis=(4, 5)) == 0).all(1)  # [N, 220, 220]
     seen = published[:, :, 2:-2, 2:-2].transpose(0, 2, 3, 1)[flat]
@@ -64,37 +52,16 @@ def test_flat_parts_have_the_published_colours():
     assert (ours[:, :, 2:-2, 2:-2].transpose(0, 2, 3, 1)[flat] == seen).all()
 
 
-# ---------------------------------------------------------------------- the scene
-
-
 def test_the_agent_covers_the_block_and_walls_cover_everything():
     state = np.array([300.0, 300.0, 300.0, 260.0, 0.0, 0.0, 0.0])
     assert render_pixels(state, size=512)[:, 300, 300].tolist() == [78, 126, 255]
     on_wall = render_pixels(np.array([5.0, 100.0, 300.0, 300.0, 0.0, 0.0, 0.0]), size=512)
-    assert on_wall[:, 100, 5].tolist() == [211, 211, 211]
-    assert on_wall[:, 100, 12].tolist() == [78, 126, 255]
+    assert on_wall[:, 100, 5].tolist() == [211, 211, 211] and on_wall[:, 100, 12].tolist() == [78, 126, 255]
 
 
-def test_velocities_are_not_drawn():
+def test_velocities_and_what_is_outside_are_not_drawn():
     states = scenes(3)
-    still = states.copy()
-    still[:, 5:] = 0
-    assert (render_pixels(states, size=64) == render_pixels(still, size=64)).all()
-
-
-def test_the_green_t_can_be_left_out():
-    green = (render_pixels(np.array(AWAY), size=64) == np.array([144, 238, 144])[:, None, None]).all(0)
-    assert green.sum() > 50
-    bare = render_pixels(np.array(AWAY), size=64, draw_goal=False)
-    assert (bare[:, green] == 255).all()
-
-
-def test_the_green_t_has_no_seam():
-    """Its pixels inside are pure, where bar and stem meet too: window pixel (256 - 21, 256 + 21) is on that line."""
-    assert render_pixels(np.array(AWAY), size=512)[:, 277, 235].tolist() == [144, 238, 144]
-
-
-def test_agent_and_block_may_be_partly_or_fully_outside():
+    assert (render_pixels(states, size=64) == render_pixels(states * [1, 1, 1, 1, 1, 0, 0], size=64)).all()
     empty = render_pixels(np.array(AWAY), size=64)
     for x in (-172.0, -20.0, 1e4):
         assert (render_pixels(np.array([x, 256.0, *AWAY[2:]]), size=64) == empty).all()
@@ -102,7 +69,12 @@ def test_agent_and_block_may_be_partly_or_fully_outside():
     assert (half != empty).any()
 
 
-# ---------------------------------------------------------------------- sizes, batches, bits
+def test_the_green_t_can_be_left_out_and_has_no_seam():
+    """Its pixels inside are pure, where bar and stem meet too: window pixel (256 - 21, 256 + 21) is on that line."""
+    green = (render_pixels(np.array(AWAY), size=64) == np.array([144, 238, 144])[:, None, None]).all(0)
+    assert green.sum() > 50
+    assert (render_pixels(np.array(AWAY), size=64, draw_goal=False)[:, green] == 255).all()
+    assert render_pixels(np.array(AWAY), size=512)[:, 277, 235].tolist() == [144, 238, 144]
 
 
 @pytest.mark.parametrize("size", [16, 64, 128])
@@ -127,33 +99,24 @@ def test_pictures_move_smoothly(size):
 def test_batches_equal_single_pictures_to_the_bit(size):
     states = scenes(6)
     batch = render_pixels(states.reshape(2, 3, 7), size=size)
-    assert batch.shape == (2, 3, 3, size, size)
-    assert batch.dtype == np.uint8
+    assert batch.shape == (2, 3, 3, size, size) and batch.dtype == np.uint8
     for state, picture in zip(states, batch.reshape(6, 3, size, size), strict=True):
         assert (render_pixels(state, size=size) == picture).all()
 
 
-def test_pictures_belong_to_the_caller_and_states_are_left_alone():
-    states = scenes(1)
+def test_states_are_arrays_or_tensors_which_are_left_alone_and_pictures_belong_to_the_caller():
+    states = scenes(2)
     given = states.copy()
     first = render_pixels(states, size=32)
     kept = first.copy()
     first[:] = 0
-    assert (render_pixels(states, size=32) == kept).all()
-    assert (states == given).all()
-
-
-def test_tensors_and_empty_batches_are_accepted():
-    states = scenes(2)
-    assert (render_pixels(torch.from_numpy(states), size=32) == render_pixels(states, size=32)).all()
+    assert (render_pixels(torch.from_numpy(states), size=32) == kept).all() and (states == given).all()
     assert render_pixels(np.empty((0, 7)), size=32).shape == (0, 3, 32, 32)
-
-
-def test_bad_arguments_are_refused():
-    with pytest.raises(ValueError, match=r"states must be \[..., 7\], got \(5,\)"):
-        render_pixels(np.zeros(5))
-    with pytest.raises(ValueError, match="states must be finite"):
-        render_pixels(np.full(7, np.nan))
-    for size in (0, 2.5):
-        with pytest.raises(ValueError, match=f"size must be a positive integer, got {size}"):
-            render_pixels(np.zeros(7), size=size)
+    for wrong, size, message in (
+        (np.zeros(5), 32, r"states must be \[..., 7\], got \(5,\)"),
+        (np.full(7, np.nan), 32, "states must be finite"),
+        (states, 0, "size must be a positive integer, got 0"),
+        (states, 2.5, "size must be a positive integer, got 2.5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            render_pixels(wrong, size=size)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 
 import numpy as np
 import pytest
+from simulators import require_simulator
 
 from torchrl_ficreg.envs._gl import import_mujoco
 from torchrl_ficreg.envs.reacher import physics, tasks
 
-for name in ("mujoco", "dm_control"):
-    if importlib.util.find_spec(name) is None:
-        pytest.skip(f"{name} is not installed: pip install 'torchrl_ficreg[envs]'", allow_module_level=True)
+require_simulator("reacher", pictures=False)
 
 
 @pytest.fixture(scope="module")
@@ -24,8 +22,7 @@ def model():
 def test_the_numbers_of_the_arm(model):
     """Time step, damping, motors and stop from dm_control's file; masses from density 1000 kg/m3 and the shapes."""
     assert (model.nq, model.nv, model.nu) == (2, 2, 2)
-    assert model.opt.timestep * physics.CONTROL_STEPS == 0.04
-    assert model.dof_damping.tolist() == [0.01, 0.01]
+    assert model.opt.timestep * physics.CONTROL_STEPS == 0.04 and model.dof_damping.tolist() == [0.01, 0.01]
     assert model.actuator_gear[:, 0].tolist() == [0.05, 0.05]
     assert model.actuator_ctrlrange.tolist() == [[-1.0, 1.0], [-1.0, 1.0]]
     assert model.jnt_limited.tolist() == [0, 1]
@@ -35,9 +32,6 @@ def test_the_numbers_of_the_arm(model):
     capsules = [np.pi * 0.01**2 * length + ball for length in (0.12, 0.10)]
     assert model.body_mass[1:].tolist() == pytest.approx([1000 * volume for volume in (*capsules, ball)])
     assert model.body_mass[1:].round(4).tolist() == [0.0419, 0.0356, 0.0042]
-
-
-def test_contacts_and_warm_starts_are_off(model):
     flags = import_mujoco().mjtDisableBit
     assert model.opt.disableflags & int(flags.mjDSBL_CONTACT)
     assert model.opt.disableflags & int(flags.mjDSBL_WARMSTART)
@@ -111,8 +105,7 @@ def test_only_the_shoulder_goes_around_and_only_if_wrapped():
     goal = np.array([3.12, 0.3, 0.0, 0.0])
     for turns in (-3, -1, 1, 2):
         turned = goal + [2 * np.pi * turns + 0.03, 0, 0, 0]  # crosses the seam at pi
-        assert tasks.is_success(turned, goal)
-        assert not tasks.is_success(turned, goal, wrap=False)
+        assert tasks.is_success(turned, goal) and not tasks.is_success(turned, goal, wrap=False)
     assert not tasks.is_success(goal + [0, 2 * np.pi, 0, 0], goal)
 
 
@@ -120,10 +113,8 @@ def test_errors_of_a_batch_are_those_of_its_rows():
     rng = np.random.default_rng(0)
     states, goals = rng.normal(0, 5, (3, 7, 4)), rng.normal(0, 5, (3, 7, 4))
     batch = tasks.joint_error(states, goals)
-    assert batch.shape == (3, 7, 2)
-    assert (np.abs(batch[..., 0]) <= np.pi).all()
+    assert batch.shape == (3, 7, 2) and (np.abs(batch[..., 0]) <= np.pi).all()
     np.testing.assert_array_equal(batch[1, 2], tasks.joint_error(states[1, 2], goals[1, 2]))
     near = states + rng.normal(0, 0.05, states.shape)
     solved = tasks.is_success(states, near)
-    assert 0 < solved.sum() < solved.size
-    assert solved[1, 2] == tasks.is_success(states[1, 2], near[1, 2])
+    assert 0 < solved.sum() < solved.size and solved[1, 2] == tasks.is_success(states[1, 2], near[1, 2])

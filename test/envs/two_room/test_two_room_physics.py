@@ -11,11 +11,6 @@ from torchrl_ficreg.envs.two_room.tasks import is_success
 RULES = ["swept", "endpoint"]
 
 
-def moved(position, action, collision="swept"):
-    start = torch.tensor(position, dtype=torch.float64)
-    return step(start, torch.tensor(action, dtype=torch.float64), collision=collision).tolist()
-
-
 def random_steps(count, seed=0):
     """Legal starts, half of them around the door, and actions up to twice the bounds."""
     generator = torch.Generator().manual_seed(seed)
@@ -38,72 +33,50 @@ def test_geometry_is_the_published_one():
     assert (geometry.speed, geometry.success_radius) == (5, 16)
 
 
-@pytest.mark.parametrize("collision", RULES)
-def test_a_full_action_moves_five_pixels_along_each_axis_and_larger_ones_are_clipped(collision):
-    assert moved([60, 112], [1, 0], collision) == [65, 112]
-    assert moved([60, 112], [1, -1], collision) == [65, 107]
-    assert moved([60, 112], [7, -3], collision) == [65, 107]
-    assert moved([60, 112], [0, 0], collision) == [60, 112]
+@pytest.mark.parametrize(
+    ("rules", "start", "action", "end"),
+    [
+        (RULES, [60, 112], [1, 0], [65, 112]),  # five pixels along each axis
+        (RULES, [60, 112], [1, -1], [65, 107]),
+        (RULES, [60, 112], [7, -3], [65, 107]),  # clipped
+        (RULES, [60, 112], [0, 0], [60, 112]),
+        (RULES, [22, 202], [-1, 1], [21, 203]),  # the border stops it one radius before the line
+        (RULES, [15, 209], [0, 0], [21, 203]),  # a published start outside is moved in by any step
+        (RULES, [98, 150], [1, 1], [99.5, 155]),  # the wall stops it at its rest position and lets it slide
+        (RULES, [126, 150], [-1, -1], [124.5, 145]),
+        *[(RULES, [98, y], [1, 0], [x, y]) for y, x in ((33.2, 99.5), (33.25, 103), (64.75, 103), (64.8, 99.5))],  # the door
+        *[(RULES, [126, y], [-1, 0], [x, y]) for y, x in ((33.2, 124.5), (33.25, 121), (64.75, 121), (64.8, 124.5))],
+        # Published: leaving the door's interval inside the corridor costs up to 11.5 px.
+        (["endpoint"], [111, 64], [0, 1], [99.5, 69]),
+        (["endpoint"], [113, 64], [0, 1], [124.5, 69]),
+        (["swept"], [111, 64], [0, 1], [111, 64.75]),
+        (["swept"], [113, 34], [0, -1], [113, 33.25]),
+        # From (98, 68) to (103, 63) the segment meets the face at y = 66, which is outside the door.
+        (["endpoint"], [98, 68], [1, -1], [103, 63]),
+        (["swept"], [98, 68], [1, -1], [99.5, 63]),
+        # From (103, 64) by (-5, +5) the jamb is met at y = 64.75, before the face at x = 100; else the face comes first.
+        (["swept"], [103, 64], [-1, 1], [98, 64.75]),
+        (["swept"], [100.5, 64], [-1, 1], [95.5, 69]),
+    ],
+)
+def test_steps_are_the_published_ones_and_those_of_the_swept_rule(rules, start, action, end):
+    start, action = (torch.tensor(value, dtype=torch.float64) for value in (start, action))
+    assert [step(start, action, collision=rule).tolist() for rule in rules] == [end] * len(rules)
 
 
-@pytest.mark.parametrize("collision", RULES)
-def test_the_border_stops_the_agent_one_radius_before_the_line(collision):
-    assert moved([22, 202], [-1, 1], collision) == [21, 203]
-    assert moved([15, 209], [0, 0], collision) == [21, 203]  # a published start outside is moved in by any step
+def test_a_swept_step_never_passes_through_the_obstacle_and_is_not_thrown_back():
+    """101 points along each of 40,000 segments from the old to the new position are free.
 
-
-@pytest.mark.parametrize("collision", RULES)
-def test_the_wall_stops_the_agent_at_its_rest_position_and_lets_it_slide(collision):
-    assert moved([98, 150], [1, 1], collision) == [99.5, 155]
-    assert moved([126, 150], [-1, -1], collision) == [124.5, 145]
-
-
-@pytest.mark.parametrize("collision", RULES)
-@pytest.mark.parametrize(("y", "enters"), [(33.2, False), (33.25, True), (64.75, True), (64.8, False)])
-def test_the_door_lets_through_exactly_its_interval(collision, y, enters):
-    assert moved([98, y], [1, 0], collision) == [103 if enters else 99.5, y]
-    assert moved([126, y], [-1, 0], collision) == [121 if enters else 124.5, y]
-
-
-def test_only_the_endpoint_rule_moves_an_agent_in_the_corridor_back():
-    """Published behaviour: leaving the door's interval inside the corridor costs up to 11.5 px."""
-    assert moved([111, 64], [0, 1], "endpoint") == [99.5, 69]
-    assert moved([113, 64], [0, 1], "endpoint") == [124.5, 69]
-    assert moved([111, 64], [0, 1], "swept") == [111, 64.75]
-    assert moved([113, 34], [0, -1], "swept") == [113, 33.25]
-
-
-def test_only_the_endpoint_rule_lets_an_agent_cut_the_corner_of_a_jamb():
-    """From (98, 68) to (103, 63) the segment meets the face at y = 66, which is outside the door."""
-    assert moved([98, 68], [1, -1], "endpoint") == [103, 63]
-    assert moved([98, 68], [1, -1], "swept") == [99.5, 63]
-
-
-def test_leaving_the_corridor_through_a_jamb_keeps_the_agent_within_the_door():
-    """From (103, 64) by (-5, +5) the jamb is met at y = 64.75, before the face at x = 100."""
-    assert moved([103, 64], [-1, 1]) == [98, 64.75]
-    assert moved([100.5, 64], [-1, 1]) == [95.5, 69]  # past the face (at y = 64.5) first: free
-
-
-def test_a_swept_step_never_passes_through_the_obstacle():
-    """101 points along each of 40,000 segments from the old to the new position are free."""
+    Each coordinate moves by 5 px at most, while the published rule moves one by over 11.
+    """
     starts, actions = random_steps(40_000)
     ends = step(starts, actions)
     share = torch.linspace(0, 1, 101, dtype=torch.float64)[:, None, None]
-    along = starts + share * (ends - starts)  # [101, N, 2]
-    x, y = along.unbind(-1)
+    x, y = (starts + share * (ends - starts)).unbind(-1)  # [101, N]
     slack = 1e-9  # rounding of the points themselves
-    inside = (x > 100 + slack) & (x < 124 - slack) & ((y < 33.25 - slack) | (y > 64.75 + slack))
-    assert not inside.any()
-    assert is_legal(ends).all()
-
-
-def test_a_swept_step_is_never_longer_than_the_action_allows():
-    """No throw-back: each coordinate moves by 5 px at most, while the published rule moves one by over 11."""
-    starts, actions = random_steps(40_000, seed=1)
-    assert (step(starts, actions) - starts).abs().max() <= 5 + 1e-9
-    thrown = (step(starts, actions, collision="endpoint") - starts).abs()
-    assert thrown.max() > 11
+    assert not ((x > 100 + slack) & (x < 124 - slack) & ((y < 33.25 - slack) | (y > 64.75 + slack))).any()
+    assert is_legal(ends).all() and (ends - starts).abs().max() <= 5 + 1e-9
+    assert (step(starts, actions, collision="endpoint") - starts).abs().max() > 11
 
 
 def test_the_rules_agree_bit_for_bit_away_from_the_jambs():
@@ -112,8 +85,7 @@ def test_the_rules_agree_bit_for_bit_away_from_the_jambs():
     x, y = starts.unbind(-1)
     easy = ((x - 112).abs() > 17) | ((y > 38.25) & (y < 59.75)) | (y < 28.25) | (y > 69.75)
     swept, endpoint = (step(starts, actions, collision=rule) for rule in RULES)
-    assert torch.equal(swept[easy], endpoint[easy])
-    assert not torch.equal(swept[~easy], endpoint[~easy])
+    assert torch.equal(swept[easy], endpoint[easy]) and not torch.equal(swept[~easy], endpoint[~easy])
 
 
 @pytest.mark.parametrize("collision", RULES)
@@ -131,25 +103,19 @@ def test_mirrored_scenes_move_mirrored(collision):
 
 @pytest.mark.parametrize("shape", [(), (6,), (2, 3)])
 def test_batch_dimensions_and_dtype_are_free_and_inputs_unchanged(shape):
-    starts = torch.rand(*shape, 2) * 70 + 21
-    actions = torch.rand(*shape, 2)
+    starts, actions = torch.rand(*shape, 2) * 70 + 21, torch.rand(*shape, 2)
     before = starts.clone(), actions.clone()
     result = step(starts, actions)
-    assert result.shape == (*shape, 2)
-    assert result.dtype == torch.float32
+    assert result.shape == (*shape, 2) and result.dtype == torch.float32
     one_by_one = [step(start, action) for start, action in zip(starts.reshape(-1, 2), actions.reshape(-1, 2))]
     assert torch.equal(result.reshape(-1, 2), torch.stack(one_by_one))
-    assert torch.equal(starts, before[0])
-    assert torch.equal(actions, before[1])
+    assert torch.equal(starts, before[0]) and torch.equal(actions, before[1])
 
 
-def test_success_is_strictly_closer_than_sixteen_pixels():
+def test_success_is_strictly_closer_than_sixteen_pixels_and_only_the_obstacle_is_illegal():
     goal = torch.tensor([60.0, 60.0], dtype=torch.float64)
     near = goal + torch.tensor([[15.999, 0], [16, 0], [0, -16], [11.3, 11.3]], dtype=torch.float64)
     assert is_success(near, goal).tolist() == [True, False, False, True]
-
-
-def test_faces_and_jambs_are_free_and_the_obstacle_is_not():
     points = torch.tensor([[100, 150], [124, 150], [112, 33.25], [112, 64.75], [112, 65], [100.01, 150]])
     assert in_wall(points).tolist() == [False, False, False, False, True, True]
     assert is_legal(torch.tensor([[14.0, 210.0], [13.9, 50.0], [float("nan"), 50.0]])).tolist() == [True, False, False]

@@ -18,6 +18,7 @@ from torchrl_ficreg.evaluation import latent_distance, rank_correlation, wilson_
         (0, 20, 0.0000, 0.1611),
         (1, 29, 0.0061, 0.1718),
         (29, 29, 0.8830, 1.0000),  # by symmetry from 0 of 29: 0 to 0.1170
+        (0, 0, 0.0, 1.0),  # no trial tells nothing
     ],
 )
 def test_the_interval_is_the_published_one(successes, trials, low, high):
@@ -34,34 +35,30 @@ def test_the_interval_is_symmetric_stays_in_bounds_and_shrinks_with_more_trials(
             assert narrow[1] - narrow[0] < wide[1] - wide[0]
 
 
-def test_no_trial_tells_nothing_and_impossible_counts_are_refused():
-    assert wilson_interval(0, 0) == (0.0, 1.0)
-    for successes, trials in ((3, 2), (-1, 5)):
-        with pytest.raises(ValueError, match=f"got {successes} of {trials}"):
-            wilson_interval(successes, trials)
+@pytest.mark.parametrize(("successes", "trials"), [(3, 2), (-1, 5)])
+def test_impossible_counts_are_refused(successes, trials):
+    with pytest.raises(ValueError, match=f"got {successes} of {trials}"):
+        wilson_interval(successes, trials)
 
 
-def test_rank_correlation_sees_order_only():
-    values = np.random.default_rng(0).normal(size=50)
-    assert rank_correlation(values, np.exp(values)) == pytest.approx(1)
-    assert rank_correlation(values, -(values**3)) == pytest.approx(-1)
+VALUES = np.random.default_rng(0).normal(size=50)
+IQ = np.array([106, 100, 86, 101, 99, 103, 97, 113, 112, 110])
+HOURS = np.array([7, 27, 2, 50, 28, 29, 20, 12, 6, 17])
 
 
-def test_rank_correlation_is_spearmans():
-    """Ten pupils, ranked by IQ and by hours of television (a standard textbook example): -29 / 165."""
-    iq = np.array([106, 100, 86, 101, 99, 103, 97, 113, 112, 110])
-    hours = np.array([7, 27, 2, 50, 28, 29, 20, 12, 6, 17])
-    assert rank_correlation(iq, hours) == pytest.approx(-29 / 165)
-
-
-def test_equal_values_share_their_rank():
-    """Ranks 1, 2.5, 2.5, 4 against 1, 2, 3, 4: covariance 4.5, variances 4.5 and 5."""
-    assert rank_correlation(np.array([0, 1, 1, 2]), np.arange(4)) == pytest.approx(4.5 / (4.5 * 5) ** 0.5)
-
-
-def test_a_collapsed_latent_space_correlates_with_nothing():
-    """All latent distances equal: no order, hence 0, whatever the order of the pairs."""
-    assert rank_correlation(np.arange(10), np.zeros(10)) == 0
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        (IQ, HOURS, -29 / 165),  # ten pupils, ranked by IQ and by hours of television: a standard textbook example
+        (VALUES, np.exp(VALUES), 1),  # the order alone counts
+        (VALUES, -(VALUES**3), -1),
+        (np.array([0, 1, 1, 2]), np.arange(4), 4.5 / (4.5 * 5) ** 0.5),  # equal values share a rank: 1, 2.5, 2.5, 4
+        (np.arange(10), np.zeros(10), 0),  # of a collapsed latent space: no order
+    ],
+    ids=["textbook", "increasing", "decreasing", "ties", "collapsed"],
+)
+def test_rank_correlation_is_spearmans(first, second, expected):
+    assert rank_correlation(first, second) == pytest.approx(expected)
 
 
 class Positions:
@@ -91,15 +88,12 @@ def walks() -> OfflineTrajectories:
     return OfflineTrajectories.from_episodes(episodes, split="all", num_frames=2, frame_skip=1)
 
 
-def test_a_latent_that_is_the_state_follows_it_perfectly(walks):
-    profile = latent_distance(Positions(scale=0.1), walks, num_frames=100)
-    assert profile.rank_correlation == pytest.approx(1, abs=1e-6)
+@pytest.mark.parametrize(("scale", "expected"), [(0.1, 1), (0.0, 0)], ids=["the state", "collapsed"])
+def test_a_latent_that_is_the_state_follows_it_perfectly_and_a_collapsed_one_not_at_all(walks, scale, expected):
+    profile = latent_distance(Positions(scale), walks, num_frames=100)
+    assert profile.rank_correlation == pytest.approx(expected, abs=1e-6)
     assert len(profile.true) == 100 * 99 / 2
-    assert profile.latent == pytest.approx(0.1 * profile.true, rel=1e-5)
-
-
-def test_a_collapsed_encoder_gives_no_slope(walks):
-    assert latent_distance(Positions(scale=0.0), walks).rank_correlation == 0
+    assert profile.latent == pytest.approx(scale * profile.true, rel=1e-5)
 
 
 def test_the_same_frames_are_compared_every_time_and_never_more_than_there_are(walks):

@@ -6,25 +6,13 @@ from dataclasses import fields
 
 import pytest
 import torch
+from _losses import make_clip, make_loss
 from mock_cuda import CUDA, MixedDevices, MockCuda, to_cuda
 from scenes import same_room_pairs
 
-from torchrl_ficreg import FICRegLoss, GoalPolicy, make_world_model, ModelConfig, MPCPolicy
+from torchrl_ficreg import GoalPolicy, MPCPolicy
 from torchrl_ficreg.evaluation import evaluate_mpc
 from torchrl_ficreg.planners import base as common, SEARCHES
-
-SIZES = ModelConfig(
-    encoder="conv",
-    image_size=16,
-    frame_skip=2,
-    latent_dim=4,
-    history=2,
-    conv_channels=(4, 8),
-    predictor_depth=1,
-    predictor_width=16,
-    predictor_heads=2,
-    predictor_dim_head=8,
-)
 
 
 def test_the_mocked_device_refuses_what_cuda_refuses():
@@ -39,16 +27,15 @@ def test_the_mocked_device_refuses_what_cuda_refuses():
 
 @pytest.mark.parametrize("history", ["context", "one_frame"])
 @pytest.mark.parametrize("search", SEARCHES)
-def test_a_model_on_cuda_plans_for_environments_on_the_cpu(monkeypatch, search, history):
+def test_a_model_on_cuda_plans_for_environments_on_the_cpu(monkeypatch, tiny_world, search, history):
     """Three plans of an episode, the later ones with a past and a plan to continue; the outcome is that of the CPU."""
-    torch.manual_seed(0)
-    model, _ = make_world_model(SIZES, action_dim=2)
-    policy = GoalPolicy(latent_dim=4, action_dim=4) if search == "policy" else None
+    model = tiny_world()
+    policy = GoalPolicy(latent_dim=6, action_dim=4) if search == "policy" else None
     kind = SEARCHES[search].config_class
     settings = {"num_candidates": 8, "num_elites": 4, "iterations": 2, "horizon": 2, "receding_horizon": 1}
     known = {field.name for field in fields(kind)} & settings.keys()
     config = kind(**{name: settings[name] for name in known}, history=history, precision="fp32")
-    planner = SEARCHES[search](model.eval(), config, action_bounds=([-1, -1], [1, 1]), policy=policy)
+    planner = SEARCHES[search](model, config, action_bounds=([-1, -1], [1, 1]), policy=policy)
 
     def outcome():
         return evaluate_mpc(MPCPolicy(planner), same_room_pairs(3), budget=6, image_size=16, num_envs=2, progress_bar=False)
@@ -63,12 +50,9 @@ def test_a_model_on_cuda_plans_for_environments_on_the_cpu(monkeypatch, search, 
 
 
 def test_a_loss_on_cuda_computes_on_cuda():
-    model, inverse_model = make_world_model(SIZES, action_dim=2)
-    loss = FICRegLoss(model.encoder, model.predictor, inverse_model, diagnostics=True)
-    pixels = torch.randint(0, 256, (4, 3, 3, 16, 16), dtype=torch.uint8)
-    clip = {"pixels": pixels, "action": torch.randn(4, 3, 4), "mask": torch.ones(4, 3, dtype=torch.bool)}
+    loss, clip = make_loss("diagnostics"), make_clip()
     with MockCuda():
         to_cuda(loss)
-        output = loss(**{name: value.to("cuda") for name, value in clip.items() if name != "mask"})
+        output = loss(pixels=clip["pixels"].to("cuda"), action=clip["action"].to("cuda"))
         for value in output if isinstance(output, tuple) else output.values():
             assert value.device == CUDA

@@ -11,7 +11,7 @@ import torch
 from scenes import make_pairs, same_room_pairs, Walker
 from tensordict import TensorDict
 
-from torchrl_ficreg import CEMConfig, LatentCEMPlanner, make_world_model, ModelConfig, MPCPolicy
+from torchrl_ficreg import CEMConfig, LatentCEMPlanner, MPCPolicy
 from torchrl_ficreg.envs.two_room import render_pixels
 from torchrl_ficreg.envs.two_room.env import TwoRoomEnv
 from torchrl_ficreg.evaluation import evaluate_mpc, save_episodes_gif, UniformPolicy
@@ -19,29 +19,19 @@ from torchrl_ficreg.evaluation import evaluate_mpc, save_episodes_gif, UniformPo
 BOX = ([-1.0, -1.0], [1.0, 1.0])
 
 
+def same_frames(ours, theirs) -> bool:
+    return all(np.array_equal(one, other) for one, other in zip(ours, theirs, strict=True))
+
+
 def evaluate(policy, pairs, **settings):
     return evaluate_mpc(policy, pairs, **{"budget": 8, "image_size": 16, "progress_bar": False, **settings})
 
 
-@pytest.fixture(scope="module")
-def planner():
+@pytest.fixture
+def planner(tiny_world):
     """CEM over a tiny untrained model: it plans badly, but it plans."""
-    torch.manual_seed(0)
-    sizes = ModelConfig(
-        encoder="conv",
-        image_size=16,
-        frame_skip=2,
-        latent_dim=4,
-        history=1,
-        conv_channels=(4, 8),
-        predictor_depth=1,
-        predictor_width=16,
-        predictor_heads=2,
-        predictor_dim_head=8,
-    )
-    model, _ = make_world_model(sizes, action_dim=2)
     config = CEMConfig(num_candidates=16, num_elites=4, iterations=2, horizon=2, receding_horizon=1)
-    return MPCPolicy(LatentCEMPlanner(model.eval(), config, action_bounds=BOX))
+    return MPCPolicy(LatentCEMPlanner(tiny_world(history=1), config, action_bounds=BOX))
 
 
 @pytest.mark.parametrize("num_envs", [1, 3, 50])
@@ -53,31 +43,22 @@ def test_an_oracle_reaches_every_goal_and_stays(num_envs):
 
 def test_the_oracle_arrives_when_physics_says():
     """80 px at 5 px a step, reached closer than 16 px: 60 is at 13 steps (65 px walked, 15 left), not before."""
-    outcome = evaluate(Walker(), make_pairs([[60, 60]], [[60, 140]]), budget=20)
-    assert outcome.success[0].argmax() == 13
-    assert outcome.summary()["first_success_step"] == [13]
-    assert evaluate(Walker(), make_pairs([[60, 60]], [[60, 140]]), budget=12).success_rate == 0
+    pairs = make_pairs([[60, 60]], [[60, 140]])
+    outcome = evaluate(Walker(), pairs, budget=20)
+    assert outcome.success[0].argmax() == 13 and outcome.summary()["first_success_step"] == [13]
+    assert evaluate(Walker(), pairs, budget=12).success_rate == 0
 
 
 @pytest.mark.parametrize("policy", ["random", "planner"])
-def test_an_outcome_does_not_depend_on_how_many_run_side_by_side(policy, planner, request):
-    """1, 3 or all at once: the same frames, hence the same actions, to the last pixel."""
-    chosen = planner if policy == "planner" else UniformPolicy(*BOX)
-    pairs = same_room_pairs()
-    runs = [evaluate(chosen, pairs, num_envs=number, record=len(pairs)) for number in (1, 3, len(pairs))]
+def test_an_outcome_does_not_depend_on_how_many_run_side_by_side(policy, planner):
+    """1, 3 or all at once, and the first three alone: the same frames, hence the same actions, to the last pixel."""
+    chosen, pairs = planner if policy == "planner" else UniformPolicy(*BOX), same_room_pairs()
+    runs = [evaluate(chosen, pairs, num_envs=number, record=len(pairs)) for number in (len(pairs), 1, 3)]
     for other in runs[1:]:
-        assert np.array_equal(other.success, runs[0].success)
-        assert len(other.frames) == len(pairs)
-        assert all(np.array_equal(a, b) for a, b in zip(other.frames, runs[0].frames))
-        assert all(np.array_equal(a, b) for a, b in zip(other.goals, runs[0].goals))
-
-
-def test_the_pairs_of_a_subset_come_out_as_in_the_whole(planner):
-    """The first three of seven, alone: same outcome."""
-    pairs = same_room_pairs()
-    few = make_pairs(pairs.start_state[:3], pairs.goal_state[:3])
-    whole, part = (evaluate(planner, which, record=len(which)) for which in (pairs, few))
-    assert all(np.array_equal(a, b) for a, b in zip(whole.frames[:3], part.frames))
+        assert np.array_equal(other.success, runs[0].success) and len(other.frames) == len(pairs)
+        assert same_frames(other.frames, runs[0].frames) and same_frames(other.goals, runs[0].goals)
+    part = evaluate(chosen, make_pairs(pairs.start_state[:3], pairs.goal_state[:3]), record=3)
+    assert same_frames(part.frames, runs[0].frames[:3])
 
 
 def test_worker_processes_change_nothing():
@@ -85,7 +66,7 @@ def test_worker_processes_change_nothing():
     pairs = same_room_pairs(6)
     here, there = (evaluate(UniformPolicy(*BOX), pairs, num_workers=n, num_envs=3, record=6) for n in (None, 2))
     assert np.array_equal(here.success, there.success)
-    assert all(np.array_equal(a, b) for a, b in zip(here.frames, there.frames, strict=True))
+    assert same_frames(here.frames, there.frames)
 
 
 def test_the_global_random_state_takes_no_part(planner):
@@ -95,8 +76,7 @@ def test_the_global_random_state_takes_no_part(planner):
         torch.manual_seed(seed)
         np.random.seed(seed)  # noqa: NPY002
         runs.append([evaluate(policy, pairs, record=3) for policy in (planner, UniformPolicy(*BOX))])
-    for first, second in zip(*runs):
-        assert all(np.array_equal(a, b) for a, b in zip(first.frames, second.frames))
+    assert all(same_frames(first.frames, second.frames) for first, second in zip(*runs))
 
 
 def test_the_random_baseline_is_uniform_between_the_bounds_and_seeded():
@@ -114,8 +94,7 @@ def test_the_random_baseline_is_uniform_between_the_bounds_and_seeded():
 def test_reaching_a_goal_and_staying_there_are_counted_apart():
     """A policy that always walks down passes through a goal 50 px below and is long gone at the end."""
     outcome = evaluate(Walker(stop=False), make_pairs([[60, 40]], [[60, 90]]), budget=25)
-    assert outcome.success_rate == 1
-    assert outcome.summary()["success_rate_at_end"] == 0
+    assert (outcome.success_rate, outcome.summary()["success_rate_at_end"]) == (1, 0)
     assert outcome.success[0].nonzero()[0].tolist() == list(range(7, 14))  # |50 - 5 k| < 16
 
 
@@ -124,11 +103,9 @@ def test_pairs_solved_at_the_start_are_counted_apart():
     pairs = make_pairs([[60, 60], [60, 60], [60, 60]], [[60, 65], [60, 80], [30, 200]])
     outcome = evaluate(Walker(stop=False), pairs, budget=4)
     summary = outcome.summary()
-    assert outcome.at_start.tolist() == [True, False, False]
-    assert summary["solved_at_start"] == 1
-    assert summary["success_rate"] == pytest.approx(2 / 3)
-    assert summary["success_rate_unsolved_at_start"] == pytest.approx(1 / 2)
-    assert summary["first_success_step"] == [1, 1, -1]
+    assert outcome.at_start.tolist() == [True, False, False] and summary["solved_at_start"] == 1
+    rates = [summary["success_rate"], summary["success_rate_unsolved_at_start"]]
+    assert rates == pytest.approx([2 / 3, 1 / 2]) and summary["first_success_step"] == [1, 1, -1]
 
 
 def test_a_goal_left_by_the_first_step_is_no_success_of_the_policy():
@@ -141,14 +118,11 @@ def test_a_goal_left_by_the_first_step_is_no_success_of_the_policy():
 @pytest.mark.parametrize("record", [0, 2])
 def test_a_summary_is_plain_json(planner, record):
     pairs = same_room_pairs(3)
-    summary = evaluate(planner, pairs, record=record).summary()
+    outcome = evaluate(planner, pairs, record=record)
+    summary = outcome.summary()
     assert json.loads(json.dumps(summary, allow_nan=False)) == {**summary, "success_interval": [*summary["success_interval"]]}
     assert summary["pairs"] == 3 and summary["budget"] == 8 and summary["pairs_hash"] == pairs.hash
-
-
-def test_only_planning_costs_planning_time(planner):
-    assert evaluate(planner, same_room_pairs(2)).seconds_per_plan > 0
-    assert evaluate(UniformPolicy(*BOX), same_room_pairs(2)).seconds_per_plan == 0
+    assert outcome.seconds_per_plan > 0 == evaluate(UniformPolicy(*BOX), pairs).seconds_per_plan  # which does not plan
 
 
 def test_recorded_frames_are_the_rendered_states():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import csv
+import sys
 
 import imageio.v3 as imageio
 import numpy as np
@@ -45,30 +45,31 @@ def test_a_tile_shows_the_view_beside_the_goal_and_turns_green_once_reached(reco
     assert last[1] > last[0] + 60  # green
 
 
-def test_no_recorded_episode_is_a_clear_error(tmp_path):
+@pytest.mark.parametrize(("module", "draw"), [("imageio", save_episodes_gif), ("matplotlib", plot_latent_distance)])
+def test_a_missing_package_is_named(recorded, monkeypatch, tmp_path, module, draw):
+    for name in (module, f"{module}.v3"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ImportError, match=rf"needs {module}: pip install 'torchrl_ficreg\[plot\]'"):
+        draw(recorded, tmp_path / "picture")
+
+
+def test_what_cannot_be_drawn_is_refused(tmp_path):
     outcome = evaluate_mpc(Walker(), make_pairs([[60, 60]], [[60, 80]]), budget=1, image_size=8, progress_bar=False)
     with pytest.raises(ValueError, match="no episode was recorded: evaluate with record"):
         save_episodes_gif(outcome, tmp_path / "none.gif")
-    assert not list(tmp_path.iterdir())
+    (tmp_path / "metrics.csv").write_text("step,split\n1,train\n")
+    with pytest.raises(ValueError, match="metrics.csv holds no loss"):
+        plot_learning_curve(tmp_path / "metrics.csv", tmp_path / "curve.png")
+    assert [file.name for file in tmp_path.iterdir()] == ["metrics.csv"]
 
 
 def test_plots_are_pictures_of_the_size_they_should_have(tmp_path):
     """Two loss terms: two panels, 3.4 inches each at 120 dots per inch; none of it is blank."""
-    with open(tmp_path / "metrics.csv", "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["step", "split", "grad_norm", "loss_pred", "loss_sigreg"])
-        writer.writerows([[step, "train", 1.0, 1 / step, 2 / step] for step in range(1, 20)])
-        writer.writerow([19, "validation", "", 0.1, 0.2])
+    rows = ["step,split,grad_norm,loss_pred,loss_sigreg", *(f"{step},train,1.0,{1 / step},{2 / step}" for step in range(1, 20))]
+    (tmp_path / "metrics.csv").write_text("\n".join([*rows, "19,validation,,0.1,0.2"]))
     plot_learning_curve(tmp_path / "metrics.csv", tmp_path / "curve.png")
     distances = np.random.default_rng(0).uniform(size=(2, 1000))
     plot_latent_distance(DistanceProfile(*distances), tmp_path / "distance.png")
-    curve, distance = (imageio.imread(tmp_path / name) for name in ("curve.png", "distance.png"))
-    assert curve.shape[:2] == (336, 816)
-    assert distance.shape[:2] == (408, 540)
-    assert curve.std() > 10 and distance.std() > 10
-
-
-def test_a_table_without_losses_is_a_clear_error(tmp_path):
-    (tmp_path / "metrics.csv").write_text("step,split\n1,train\n")
-    with pytest.raises(ValueError, match="metrics.csv holds no loss"):
-        plot_learning_curve(tmp_path / "metrics.csv", tmp_path / "curve.png")
+    for name, size in (("curve.png", (336, 816)), ("distance.png", (408, 540))):
+        picture = imageio.imread(tmp_path / name)
+        assert picture.shape[:2] == size and picture.std() > 10

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 
 import pytest
 import torch
@@ -41,10 +42,8 @@ class Exchanged(nn.Module):
 
 def rewrap(module, in_keys, out_key, exchange):
     """The network of a module behind other keys, those exchanged where asked for, and its inputs with them."""
-    if exchange:
-        wrapped = TensorDictModule(Exchanged(module.module), list(in_keys)[::-1], [out_key])
-    else:
-        wrapped = TensorDictModule(module.module, list(in_keys), [out_key])
+    network, keys = (Exchanged(module.module), in_keys[::-1]) if exchange else (module.module, in_keys)
+    wrapped = TensorDictModule(network, list(keys), [out_key])
     if module.module.__class__.__name__ == "CausalTransformer":
         wrapped.history = module.history
     return wrapped
@@ -127,13 +126,12 @@ def test_planners_and_costs_feed_by_name_too(latent_key):
 @pytest.mark.parametrize("exchange", [False, True])
 def test_the_packages_own_networks_sort_their_keys(exchange):
     """A constructor given its keys in the other order reads the same entries."""
-    step = -1 if exchange else 1
-    keys = ("latent", ("agent", "action"))
-    assert CausalPredictor(latent_dim=4, action_dim=4, depth=1, width=8, in_keys=keys[::step]).in_keys == list(keys)
-    keys = ("latent", "next_latent")
-    assert InverseDynamicsModel(4, 4, 8, in_keys=keys[::step]).in_keys == list(keys)
-    keys = ("latent", ("goal", "latent"))
-    assert GoalPolicy(4, 4, 8, in_keys=keys[::step]).in_keys == list(keys)
+    for make, keys in (
+        (partial(CausalPredictor, depth=1, width=8), ("latent", ("agent", "action"))),
+        (InverseDynamicsModel, ("latent", "next_latent")),
+        (GoalPolicy, ("latent", ("goal", "latent"))),
+    ):
+        assert make(latent_dim=4, action_dim=4, in_keys=keys[:: -1 if exchange else 1]).in_keys == list(keys)
 
 
 @pytest.mark.parametrize("keys", [("a", "b"), ("z", "u"), (("x", "1"), ("x", "2"))])
@@ -167,11 +165,10 @@ def test_names_that_contradict_each_other_are_refused_in_one_line(owner, names, 
     loss = FICRegLoss(**parts, sigreg=SIGReg(4))
     with pytest.raises(ValueError, match=message):
         loss(make_clip())
-    if owner == "inverse_model":
-        with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message):
+        if owner == "inverse_model":
             InverseConsistency(parts[owner])
-    else:
-        with pytest.raises(ValueError, match=message):
+        else:
             LatentWorldModel(parts["encoder"], parts[owner], frame_skip=2)
 
 
@@ -179,9 +176,8 @@ def test_set_keys_settles_what_names_leave_open():
     encoder, predictor, inverse_model = make_networks(0.0)
     keys = [("a", "latent"), ("b", "latent")]
     for first, second in itertools.permutations(keys):
-        loss = FICRegLoss(
-            encoder, rewrap(predictor, (first, second), "hat", False), inverse_model, sigreg=SIGReg(16)
-        ).eval()
+        renamed = rewrap(predictor, (first, second), "hat", False)
+        loss = FICRegLoss(encoder, renamed, inverse_model, sigreg=SIGReg(16)).eval()
         loss.set_keys(latent=first, action=second)
         clip = make_clip().rename_key_("action", second)
         expected = FICRegLoss(encoder, predictor, inverse_model, sigreg=SIGReg(16)).eval()(make_clip())

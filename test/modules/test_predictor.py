@@ -13,13 +13,8 @@ SIZES |= {"width": 8, "depth": 2, "heads": 2, "dim_head": 4, "mlp_dim": 16}
 
 
 @pytest.fixture
-def predictor():
-    torch.manual_seed(0)
-    predictor = CausalPredictor(**SIZES, projector_dim=12)
-    with torch.no_grad():
-        for param in predictor.parameters():
-            param.add_(0.3 * torch.randn_like(param))
-    return predictor.eval()
+def predictor(tiny_world):
+    return tiny_world().predictor
 
 
 @pytest.mark.parametrize("changed", ["latent", "action"])
@@ -54,27 +49,18 @@ def test_leading_dimensions_are_rows(predictor, lead, tokens):
     torch.testing.assert_close(result, flat.reshape(latent.shape))
 
 
-@pytest.mark.parametrize("context", [1, 2, 3, 4])
-def test_imagining_computes_each_token_of_a_growing_window_once(predictor, context):
+@pytest.mark.parametrize(
+    ("layer", "context", "expected"),
+    [(0, 1, [1, 1, 1, 3, 3, 3]), (0, 2, [2, 1, 3, 3, 3, 3]), (0, 3, [3] * 6), (0, 4, [3] * 6), (-1, 1, [1] * 6)],
+)
+def test_imagining_computes_each_token_of_a_growing_window_once_and_the_last_layer_the_last_alone(
+    predictor, layer, context, expected
+):
     """Six blocks from C frames on: one token a step until the window of three slides, then all three."""
     tokens = []
-    hook = predictor.module.blocks[0].mlp.register_forward_pre_hook(lambda _, x: tokens.append(x[0].shape[1]))
+    predictor.module.blocks[layer].mlp.register_forward_pre_hook(lambda _, x: tokens.append(x[0].shape[1]))
     imagined = predictor.module.rollout(torch.randn(2, context, 6), torch.randn(2, context + 5, 4))
-    hook.remove()
-    assert imagined.shape == (2, 6, 6)
-    assert tokens == {1: [1, 1, 1, 3, 3, 3], 2: [2, 1, 3, 3, 3, 3], 3: [3] * 6, 4: [3] * 6}[context]
-
-
-def test_the_last_layer_computes_the_last_token_alone(predictor):
-    tokens = []
-    predictor.module.blocks[-1].mlp.register_forward_pre_hook(lambda _, x: tokens.append(x[0].shape[1]))
-    predictor.module.rollout(torch.randn(2, 1, 6), torch.randn(2, 6, 4))
-    assert tokens == [1] * 6
-
-
-def test_a_wider_latent_needs_no_adapter_and_another_gets_one():
-    assert isinstance(CausalPredictor(**{**SIZES, "latent_dim": 8}).module.to_width, torch.nn.Identity)
-    assert isinstance(CausalPredictor(**SIZES).module.to_width, torch.nn.Linear)
+    assert imagined.shape == (2, 6, 6) and tokens == expected
 
 
 def test_keys_can_be_renamed_nested_too(predictor):

@@ -6,7 +6,7 @@ import copy
 
 import pytest
 import torch
-from _losses import call, COLLECTION, LOSSES, make_clip, make_loss, total
+from _losses import call, coefficients, COLLECTION, LOSSES, make_clip, make_loss, total
 from tensordict import TensorDict
 from torch._dynamo.testing import CompileCounterWithBackend
 from torch._subclasses import FakeTensor, FakeTensorMode
@@ -24,13 +24,7 @@ def step(loss, function, clip):
     return output.detach(), [param.grad.clone() for param in loss.parameters()]
 
 
-def coefficients(loss):
-    return sorted(name for name, _ in loss.named_buffers() if name.endswith("_coeff"))
-
-
-@pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in COLLECTION]
-)
+@pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in COLLECTION])
 def test_one_graph_gives_the_same_values_gradients_and_statistics(name):
     """And is compiled once, whatever a schedule does to the coefficients."""
     eager, graph = make_loss(name, 0.0), make_loss(name, 0.0)

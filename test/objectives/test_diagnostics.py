@@ -6,13 +6,10 @@ import math
 
 import pytest
 import torch
+from _losses import noise
 
 from torchrl_ficreg import SIGReg
 from torchrl_ficreg.objectives import latent_health
-
-
-def noise(*shape: int) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(0))
 
 
 @pytest.mark.parametrize("shape", [(4, 512, 64), (128, 192), (32, 2), (256, 1), (8, 192), (4, 8)])
@@ -23,15 +20,13 @@ def test_a_gaussian_has_a_ratio_of_1_and_raises_no_alarm(shape):
     assert health.alarm is None
 
 
-def test_effective_rank_counts_the_dimensions_that_are_used():
+@pytest.mark.parametrize("used", [2, 5, 16])
+def test_effective_rank_counts_the_dimensions_that_are_used(used):
     """Of a flat spectrum it is the number of its entries (Roy and Vetterli, 2007)."""
-    # Columns of a Hadamard matrix: orthogonal, of equal length and, but for the first, of mean 0 in exact arithmetic.
-    hadamard = torch.ones(1, 1)
-    for _ in range(7):
-        hadamard = torch.cat([torch.cat([hadamard, hadamard], 1), torch.cat([hadamard, -hadamard], 1)])  # [128, 128]
-    for used in (2, 5, 16):
-        latent = torch.cat([hadamard[:, 1 : used + 1], torch.zeros(128, 16 - used)], 1)
-        assert latent_health(latent).effective_rank == pytest.approx(used, rel=1e-3)
+    # The first columns after a constant one of an orthogonal matrix: of equal length, and of mean 0.
+    basis = torch.linalg.qr(torch.cat([torch.ones(128, 1), noise(128, used)], 1)).Q[:, 1:]
+    latent = torch.cat([basis, torch.zeros(128, 16 - used)], 1)
+    assert latent_health(latent).effective_rank == pytest.approx(used, rel=1e-3)
 
 
 @pytest.mark.parametrize("samples", [8, 128])
@@ -44,10 +39,8 @@ def test_collapse_to_a_point_raises_the_alarm(samples, place):
 
 def test_low_rank_raises_the_alarm():
     """All dimensions are equal: along some directions the latents are Gaussian, and their rank is 1."""
-    latent = noise(256, 1).expand(256, 32) / 32**0.5
-    health = latent_health(latent)
-    assert health.effective_rank == pytest.approx(1, abs=0.01)
-    assert health.alarm is not None
+    health = latent_health(noise(256, 1).expand(256, 32) / 32**0.5)
+    assert health.effective_rank == pytest.approx(1, abs=0.01) and health.alarm is not None
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 import torch.nn.functional as F
-from _losses import BLOCK, call, gradients, LATENT, make_clip, make_loss, make_mask, make_networks
+from _losses import all_equal, BLOCK, call, gradients, LATENT, make_clip, make_loss, make_mask, make_networks
 from tensordict.nn import TensorDictModule
 from torch import nn
 
@@ -93,10 +93,8 @@ def test_weights_of_1_are_mse_to_the_last_bit(monkeypatch, reduction):
     monkeypatch.setattr(ficreg, "reliability_weight", torch.ones_like)
     clip = make_clip().set("mask", make_mask())
     losses = make_loss("trusted", reduction=reduction), make_loss("paper", reduction=reduction)
-    ours, theirs = (gradients(loss, clip)["predictor"] for loss in losses)
-    assert all(one.equal(other) for one, other in zip(ours, theirs, strict=True))
-    outputs = [call(loss, clip)["loss_consistency"] for loss in losses]
-    assert outputs[0].equal(outputs[1])
+    assert all_equal(*(gradients(loss, clip)["predictor"] for loss in losses))
+    assert all_equal(*([call(loss, clip)["loss_consistency"]] for loss in losses))
 
 
 class _Recovers(nn.Module):
@@ -117,13 +115,13 @@ def with_error(error: torch.Tensor, clip, **arguments) -> FICRegLoss:
     return FICRegLoss(encoder, predictor, inverse_model, sigreg=SIGReg(4), consistency_coeff=1.0, **arguments)
 
 
-@pytest.mark.parametrize("error", [1.001, -1.5, 100.0])
-def test_an_uninformative_inverse_model_gives_no_gradient(error):
+@pytest.mark.parametrize(
+    ("error", "consistency", "moves"), [(1.001, "trusted", False), (-1.5, "trusted", False), (1.5, "mse", True)]
+)
+def test_an_uninformative_inverse_model_gives_no_gradient(error, consistency, moves):
     clip = make_clip()
-    trusted = gradients(with_error(torch.tensor(error), clip, consistency="trusted"), clip, "loss_consistency")
-    plain = gradients(with_error(torch.tensor(error), clip), clip, "loss_consistency")
-    assert all((grad == 0).all() for grad in trusted["predictor"])
-    assert sum(grad.norm() for grad in plain["predictor"]) > 0
+    found = gradients(with_error(torch.tensor(error), clip, consistency=consistency), clip, "loss_consistency")
+    assert any((grad != 0).any() for grad in found["predictor"]) == moves
 
 
 def test_weights_are_those_of_each_dimension():
@@ -155,15 +153,7 @@ def test_with_the_recovered_action_as_target_real_latents_are_a_perfect_predicti
         assert (norm > 1e-5) == moves
 
 
-def test_diagnostics_do_not_change_the_objective():
-    """Its terms, all that begin with loss_, add up to one number with a gradient, with diagnostics or without."""
-    outputs = [call(make_loss("paper", diagnostics=on), make_clip()) for on in (False, True)]
-    plain, reported = (sum(v for k, v in out.items() if k.startswith("loss_")) for out in outputs)
-    assert reported.equal(plain)
-    reported.backward()
-
-
-def test_diagnostics_are_numbers_per_action_dimension_and_follow_the_mask():
+def test_diagnostics_are_numbers_per_action_dimension_follow_the_mask_and_change_no_term():
     clip, loss = make_clip(), make_loss("diagnostics", consistency="trusted").eval()
     clip["mask"] = torch.arange(8)[:, None].expand(8, 3) < 5
     output, expected = call(loss, clip), call(loss, clip[:5].exclude("mask"))
@@ -171,3 +161,4 @@ def test_diagnostics_are_numbers_per_action_dimension_and_follow_the_mask():
         assert output[name].shape == (BLOCK,)
         torch.testing.assert_close(output[name], expected[name])
     assert (output["judge_r2_imagined"] <= 1).all()
+    assert all(output[key].equal(value) for key, value in call(make_loss("trusted").eval(), clip).items())

@@ -1,4 +1,4 @@
-"""Claims about the terms of inverse models: training error, reliability weight, and R² with its shuffled control."""
+"""Claims about the terms of inverse models: reliability weight, and R² with its shuffled control."""
 
 from __future__ import annotations
 
@@ -7,18 +7,7 @@ import math
 import pytest
 import torch
 
-from torchrl_ficreg.objectives.inverse_terms import inverse_error, inverse_model_r2, Recovered, reliability_weight
-
-
-@pytest.mark.parametrize("head", ["plain", "gaussian", "ensemble"])
-def test_gradcheck_of_the_training_error(head):
-    x, y = (0.3 * torch.randn(2, 5, 3, dtype=torch.float64).requires_grad_() for _ in range(2))
-
-    def error(x, y):
-        log_var, variance = x * y if head == "gaussian" else None, x.square() if head == "ensemble" else None
-        return inverse_error(Recovered(x, log_var, variance), y)
-
-    assert torch.autograd.gradcheck(error, (x, y))
+from torchrl_ficreg.objectives.inverse_terms import inverse_model_r2, reliability_weight
 
 
 def test_reliability_is_1_without_error_and_0_for_an_error_of_1():

@@ -25,8 +25,6 @@ def test_the_likelihood_is_that_of_a_normal_distribution():
     mean, log_var, target = noise(5, 3), noise(5, 3, seed=1), noise(5, 3, seed=2)
     density = torch.distributions.Normal(mean, (log_var / 2).exp()).log_prob(target)
     torch.testing.assert_close(gaussian_nll(mean, log_var, target), -density - 0.5 * math.log(2 * math.pi))
-    expected = torch.nn.functional.gaussian_nll_loss(mean, target, log_var.exp(), reduction="none")
-    torch.testing.assert_close(gaussian_nll(mean, log_var, target), expected)
 
 
 def test_the_variance_hinge_is_vicregs():
@@ -53,23 +51,9 @@ def test_straightness_is_the_cosine_of_the_turn(angle, expected):
     assert TemporalStraightness()(path + 7).item() == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_step_of_length_zero_has_a_straightness_of_zero():
+def test_straightness_is_differentiable_and_zero_at_a_step_of_length_zero():
     assert straightness(torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0]])).item() == 0
-
-
-@pytest.mark.parametrize(
-    "term",
-    [
-        lambda x, y: squared_error(x, y),
-        lambda x, y: gaussian_nll(x, x * y, y),
-        lambda x, y: hinge_std(x, -2),
-        lambda x, y: off_diagonal_covariance(x + y),
-        lambda x, y: straightness(x),
-    ],
-)
-def test_gradcheck(term):
-    x, y = 0.3 * noise(2, 5, 3).requires_grad_(), noise(2, 5, 3, seed=1).requires_grad_()
-    assert torch.autograd.gradcheck(term, (x, y))
+    assert torch.autograd.gradcheck(straightness, noise(2, 5, 3).requires_grad_())
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
@@ -85,17 +69,18 @@ def test_nothing_is_broadcast():
         squared_error(torch.zeros(4, 1), torch.zeros(4, 6))
 
 
-@pytest.mark.parametrize("module", [VarianceHinge(), CovariancePenalty()])
-@pytest.mark.parametrize("shape", [(8,), (1, 8), (3, 1, 8)])
-def test_statistics_of_one_sample_are_refused(module, shape):
-    with pytest.raises(ValueError, match=r"\[..., B, D\] with B >= 2"):
-        module(torch.zeros(shape))
-
-
-@pytest.mark.parametrize("shape", [(8,), (2, 8), (4, 2, 8)])
-def test_straightness_of_two_points_is_refused(shape):
-    with pytest.raises(ValueError, match="T >= 3"):
-        TemporalStraightness()(torch.zeros(shape))
+@pytest.mark.parametrize(
+    ("module", "shapes", "message"),
+    [
+        (VarianceHinge(), [(8,), (1, 8), (3, 1, 8)], r"\[..., B, D\] with B >= 2"),
+        (CovariancePenalty(), [(8,), (1, 8), (3, 1, 8)], r"\[..., B, D\] with B >= 2"),
+        (TemporalStraightness(), [(8,), (2, 8), (4, 2, 8)], "T >= 3"),
+    ],
+)
+def test_statistics_of_one_sample_and_straightness_of_two_points_are_refused(module, shapes, message):
+    for shape in shapes:
+        with pytest.raises(ValueError, match=message):
+            module(torch.zeros(shape))
 
 
 @pytest.mark.parametrize("margin", [0.0, -1.0, math.nan])

@@ -29,9 +29,9 @@ def write(folder: Path, tensors: Any, config: dict | None = None, name: str = "w
     return folder
 
 
-def assert_same(model: nn.Module, other: nn.Module) -> None:
-    """Equal names, values and dtypes."""
-    state, expected = model.state_dict(), other.state_dict()
+def assert_same(model: nn.Module | dict[str, torch.Tensor], other: nn.Module | dict[str, torch.Tensor]) -> None:
+    """Equal names, values and dtypes, of networks or of states."""
+    state, expected = (one if isinstance(one, dict) else one.state_dict() for one in (model, other))
     assert state.keys() == expected.keys()
     for name, tensor in expected.items():
         assert torch.equal(state[name], tensor) and state[name].dtype == tensor.dtype, name

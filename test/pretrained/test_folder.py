@@ -46,53 +46,84 @@ def test_a_model_its_inverse_model_and_its_card_come_back_as_they_were(tiny_worl
     assert sorted(file.name for file in tmp_path.iterdir()) == ["config.json", "model.safetensors"]
 
 
-def test_a_lewm_model_of_any_size_can_be_kept(tiny, tmp_path):
+def test_a_lewm_model_of_any_size_can_be_kept_with_a_config_for_reading(tiny, tmp_path):
     back, inverse_model, card = load_pretrained(save_pretrained(tiny, tmp_path))
     assert_same(back, tiny)
     assert (inverse_model, card) == (None, {})
-
-
-def test_the_config_is_for_reading(tiny_world, tmp_path):
-    content = json.loads((save_pretrained(tiny_world(), tmp_path, card=CARD) / "config.json").read_text())
+    content = json.loads((tmp_path / "config.json").read_text())
     assert (content["format"], content["version"]) == ("torchrl_ficreg.world_model", 1)
     assert content["world_model"]["predictor"]["history"] == 3
     assert content["statistics"] == {"mean": [0.0, 0.0], "std": [1.0, 1.0]}
-    assert content["card"]["action_high"] == [1.0, 1.0]
 
 
 def edited(**changes):
     return lambda content: content.update(changes)
 
 
+def edit(config: Path, change) -> None:
+    content = json.loads(config.read_text())
+    change(content)
+    config.write_text(json.dumps(content))
+
+
+@pytest.fixture(params=["pretrained", "policy"])
+def stored(request, tiny_world, tmp_path):
+    """Both formats on one layout: the file of weights, the configuration beside it, and what loads the folder."""
+    world_model = tiny_world()
+    if request.param == "policy":
+        save_goal_policy(GoalPolicy(6, 4, hidden_dim=16, depth=2), tmp_path, world_model)
+        return tmp_path / "policy.safetensors", tmp_path / "policy.json", partial(load_goal_policy, world_model=world_model)
+    save_pretrained(world_model, tmp_path)
+    return tmp_path / "model.safetensors", tmp_path / "config.json", load_pretrained
+
+
 @pytest.mark.parametrize(
-    ("edit", "message"),
+    ("change", "error", "message"),
     [
-        (edited(version=2), "has version 2, this release reads 1: update torchrl_ficreg"),
-        (edited(format="other"), "is not of the format 'torchrl_ficreg.world_model'"),
+        (lambda _, config: edit(config, edited(version=2)), ValueError, "version 2, this release reads 1: update"),
+        (lambda _, config: edit(config, edited(format="other")), ValueError, "is not of the format 'torchrl_ficreg"),
+        (lambda _, config: config.write_text("{"), ValueError, "json is not JSON"),
+        (lambda _, config: config.unlink(), FileNotFoundError, "no .*json in .*: give a folder that save_.* wrote"),
+        (lambda weights, _: weights.write_bytes(weights.read_bytes()[:-10]), ValueError, "safetensors is damaged"),
+        (lambda weights, _: weights.unlink(), FileNotFoundError, "no .*safetensors in .*: give a folder that save_.* wrote"),
+    ],
+    ids=["version", "format", "no JSON", "no configuration", "truncated", "no weights"],
+)
+def test_missing_and_damaged_files_are_named(stored, change, error, message):
+    weights, config, load = stored
+    change(weights, config)
+    with pytest.raises(error, match=message):
+        load(weights.parent)
+
+
+def test_a_flipped_byte_anywhere_is_found(stored):
+    weights, config, load = stored
+    whole = weights.read_bytes()
+    for at in range(0, len(whole), len(whole) // 10):
+        weights.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises(ValueError, match="safetensors|does not fit|belong together"):
+            load(weights.parent)
+    weights.write_bytes(whole)
+    edit(config, lambda content: content.pop("weights_sha256"))  # as folders of earlier releases
+    load(weights.parent)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
         (edited(statistics={"mean": [9.0, 0.0], "std": [1.0, 1.0]}), "hold different statistics"),
         (lambda content: content.pop("world_model"), "does not describe a world model"),
         (lambda content: content["world_model"]["encoder"].update(kind="timm"), "does not describe a world model"),
         (lambda content: content["world_model"]["predictor"].update(depth=1), "13 tensors are missing, left over or"),
         (lambda content: content["world_model"]["predictor"].update(mlp_dim=17), "6 tensors are missing, left .*mlp.0"),
         (edited(inverse_model=None), "tensors are missing, left over .*: inverse_model.module.layers.0.bias"),
+        *((edited(card=card), "card must be a JSON object") for card in (None, [], "two_room")),
     ],
 )
-def test_files_that_do_not_belong_together_are_refused(tiny_world, edit, message, tmp_path):
+def test_files_that_do_not_belong_together_are_refused(tiny_world, change, message, tmp_path):
     save_pretrained(tiny_world(), tmp_path, InverseDynamicsModel(6, 4, 16))
-    content = json.loads((tmp_path / "config.json").read_text())
-    edit(content)
-    (tmp_path / "config.json").write_text(json.dumps(content))
+    edit(tmp_path / "config.json", change)
     with pytest.raises(ValueError, match=message):
-        load_pretrained(tmp_path)
-
-
-def test_a_truncated_file_is_refused(tiny_world, tmp_path):
-    weights_file = save_pretrained(tiny_world(), tmp_path) / "model.safetensors"
-    weights_file.write_bytes(weights_file.read_bytes()[:-10])
-    with pytest.raises(ValueError, match="model.safetensors is damaged"):
-        load_pretrained(tmp_path)
-    weights_file.unlink()
-    with pytest.raises(FileNotFoundError, match="no model.safetensors in"):
         load_pretrained(tmp_path)
 
 
@@ -112,7 +143,7 @@ def test_a_card_that_does_not_fit_is_refused(tiny_world, card, error, message, t
 
 def test_without_safetensors_the_extra_is_named(tiny_world, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "safetensors.torch", None)
-    with pytest.raises(ImportError, match=r"pip install 'torchrl_ficreg\[pretrained\]'"):
+    with pytest.raises(ImportError, match=r"a saved model needs safetensors: pip install 'torchrl_ficreg\[pretrained\]'"):
         save_pretrained(tiny_world(), tmp_path)
 
 
@@ -165,35 +196,21 @@ def test_every_rate_comes_back(tiny_world, tmp_path):
         save_pretrained(model, tmp_path / "ours")
 
 
-def test_a_flipped_byte_anywhere_is_found(tiny_world, tmp_path):
-    file = save_pretrained(tiny_world(), tmp_path) / "model.safetensors"
-    whole = file.read_bytes()
-    for at in range(0, len(whole), len(whole) // 20):
-        file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
-        with pytest.raises(ValueError, match="model.safetensors|does not fit"):
-            load_pretrained(tmp_path)
-    content = json.loads((tmp_path / "config.json").read_text())
-    del content["weights_sha256"]  # as folders of earlier releases
-    (tmp_path / "config.json").write_text(json.dumps(content))
-    file.write_bytes(whole)
-    load_pretrained(tmp_path)
-
-
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("action_std", 0.0), ("action_std", -1.0), ("action_mean", float("nan")), ("action_std", float("inf"))],
+    ("name", "value", "message"),
+    [
+        ("action_std", 0.0, "action_std must be positive"),
+        ("action_std", -1.0, "action_std must be positive"),
+        ("action_std", float("inf"), "action_std holds a NaN or an infinity"),
+        ("action_mean", float("nan"), "action_mean holds a NaN or an infinity"),
+        ("predictor.module.position", float("inf"), "position holds a NaN or an infinity"),
+    ],
 )
-def test_numbers_that_no_trained_network_has_are_refused(tiny_world, name, value, tmp_path):
+def test_numbers_that_no_trained_network_has_are_refused(tiny_world, name, value, message, tmp_path):
     model = tiny_world()
-    model.get_buffer(name).fill_(value)
-    save_pretrained(model, tmp_path)
-    with pytest.raises(ValueError, match=f"{name} (holds a NaN|must be positive)"):
-        load_pretrained(tmp_path)
-    worse = tiny_world()
-    with torch.no_grad():
-        next(worse.parameters()).fill_(float("inf"))
-    with pytest.raises(ValueError, match="holds a NaN or an infinity"):
-        load_pretrained(save_pretrained(worse, tmp_path))
+    dict([*model.named_parameters(), *model.named_buffers()])[name].data.fill_(value)
+    with pytest.raises(ValueError, match=message):
+        load_pretrained(save_pretrained(model, tmp_path))
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
@@ -237,12 +254,3 @@ def test_a_save_that_fails_or_is_killed_at_any_write_leaves_a_whole_model(format
         assert snapshot(tmp_path) == before
     save(old, tmp_path)
     assert snapshot(tmp_path) == before
-
-
-@pytest.mark.parametrize("card", [None, [], "two_room"])
-def test_a_card_that_is_no_object_is_refused(tiny_world, card, tmp_path):
-    save_pretrained(tiny_world(), tmp_path)
-    content = json.loads((tmp_path / "config.json").read_text())
-    (tmp_path / "config.json").write_text(json.dumps({**content, "card": card}))
-    with pytest.raises(ValueError, match="card must be a JSON object"):
-        load_pretrained(tmp_path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from tensordict import TensorDict
 from torch import nn
@@ -10,12 +12,12 @@ from torchrl_ficreg import FICRegLoss, InverseDynamicsModel, LeWMLoss, make_worl
 from torchrl_ficreg.objectives import JointInverseLoss, PLDMLoss
 
 SIZE, BLOCK, LATENT = 16, 6, 6  # pixels, width of an action block (2 actions of 3 dimensions), width of a latent
-CONFIG = ModelConfig(
+TINY = ModelConfig(
     encoder="conv",
     image_size=SIZE,
     frame_skip=2,
     latent_dim=LATENT,
-    history=2,
+    history=3,
     conv_channels=(4, 8),
     encoder_projector_dim=12,
     predictor_width=8,
@@ -24,9 +26,9 @@ CONFIG = ModelConfig(
     predictor_dim_head=4,
     predictor_mlp_dim=16,
     predictor_projector_dim=12,
-    predictor_dropout=0.5,
     inverse_hidden_dim=16,
 )
+CONFIG = replace(TINY, history=2, predictor_dropout=0.5)
 
 BASELINE = {
     "loss_pred": {"encoder": True, "predictor": True, "inverse_model": False},
@@ -73,14 +75,12 @@ def make_networks(dropout: float = 0.5, kind: str = "mlp") -> tuple[nn.Module, n
     All parameters are moved off their start values, where zeroed layers would hide paths of the gradient.
     """
     torch.manual_seed(0)
-    model, inverse_model = make_world_model(ModelConfig(**{**vars(CONFIG), "predictor_dropout": dropout}), action_dim=3)
+    model, inverse_model = make_world_model(replace(CONFIG, predictor_dropout=dropout), action_dim=3)
     with torch.no_grad():
         for param in [*model.parameters(), *inverse_model.parameters()]:
             param.add_(0.1 * torch.randn_like(param))
     if kind != "mlp":
-        inverse_model = InverseDynamicsModel(
-            LATENT, BLOCK, 16, kind=kind, **({"history": 2} if kind == "transformer" else {})
-        )
+        inverse_model = InverseDynamicsModel(LATENT, BLOCK, 16, kind=kind, **({"history": 2} if kind == "transformer" else {}))
     return model.encoder, model.predictor, inverse_model
 
 
@@ -91,6 +91,11 @@ def make_loss(name: str, dropout: float = 0.5, **arguments) -> nn.Module:
     if make is not PLDMLoss:
         arguments.setdefault("sigreg", SIGReg(16))
     return make(*networks, **{**defaults, **arguments})
+
+
+def noise(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    """Standard normal numbers, the same at every call."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
 
 
 def make_clip(*lead: int, frames: int = 3, seed: int = 0) -> TensorDict:
@@ -119,9 +124,19 @@ def total(output: TensorDict) -> torch.Tensor:
     return sum(value.sum() for key, value in output.items() if key.startswith("loss"))
 
 
+def coefficients(loss: nn.Module) -> list[str]:
+    """Names of the coefficients of its terms."""
+    return sorted(name for name, _ in loss.named_buffers() if name.endswith("_coeff"))
+
+
 def gradients(loss: nn.Module, clip: TensorDict, *terms: str) -> dict[str, list[torch.Tensor | None]]:
     """Gradients of the parameters of each network from some terms, from all by default."""
     loss.zero_grad()
     output = call(loss, clip)
     total(output.select(*terms) if terms else output).backward()
     return {name: [param.grad for param in getattr(loss, name).parameters()] for name in loss._networks}
+
+
+def all_equal(ours, theirs) -> bool:
+    """Whether two sequences of tensors are the same to the last bit."""
+    return all(one.equal(other) for one, other in zip(ours, theirs, strict=True))

@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import signal
 from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
+from _losses import TINY
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from torchrl_ficreg import LatentWorldModel, make_world_model, ModelConfig
+from torchrl_ficreg import LatentWorldModel, make_world_model
 from torchrl_ficreg.data import ActionStatistics
+from torchrl_ficreg.envs import _workers
 
-TINY = {
-    "encoder": "conv",
-    "image_size": 16,
-    "frame_skip": 2,
-    "latent_dim": 6,
-    "history": 3,
-    "conv_channels": (4, 8),
-    "encoder_projector_dim": 12,
-    "predictor_width": 8,
-    "predictor_depth": 2,
-    "predictor_heads": 2,
-    "predictor_dim_head": 4,
-    "predictor_mlp_dim": 16,
-    "predictor_projector_dim": 12,
-    "inverse_hidden_dim": 16,
-}
+if FORKSERVER := "forkserver" in multiprocessing.get_all_start_methods():
+    multiprocessing.set_forkserver_preload(["torchrl_ficreg.trainers", "torchrl_ficreg.envs"])
 
 
 class LinearDynamics(nn.Module):
@@ -69,7 +60,7 @@ def tiny_world() -> Callable[..., LatentWorldModel]:
 
     def tiny_world(action_dim: int = 2, **sizes) -> LatentWorldModel:
         torch.manual_seed(0)
-        model, _ = make_world_model(ModelConfig(**{**TINY, **sizes}), action_dim)
+        model, _ = make_world_model(replace(TINY, **sizes), action_dim)
         with torch.no_grad():
             for param in model.parameters():
                 param.add_(0.3 * torch.randn_like(param))
@@ -83,6 +74,19 @@ def fast_bf16(request, monkeypatch) -> bool:
     """Whether this processor is taken for one with fast bfloat16 products: a test runs once for each."""
     monkeypatch.setattr("torchrl_ficreg._device.has_fast_bf16", lambda device, kind="products": request.param)
     return request.param
+
+
+@pytest.fixture(autouse=True, scope="session")
+def quick_workers():
+    """Worker processes are forked from a server that has imported the package, which takes seconds.
+
+    They are spawned, as outside of tests, in most of test_workers.py and by scripts in processes of their own.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if FORKSERVER:
+            context = multiprocessing.get_context("forkserver")
+            patch.setattr(_workers, "multiprocessing", SimpleNamespace(get_context=lambda method: context))
+        yield
 
 
 @pytest.fixture(autouse=True, scope="session")

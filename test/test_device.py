@@ -13,13 +13,7 @@ from torch import nn
 from torch._subclasses import FakeTensorMode
 
 from torchrl_ficreg import _device as precision, ConvEncoder, KeypointEncoder, ViTEncoder
-from torchrl_ficreg._device import (
-    autocast,
-    bf16_speedup,
-    describe_precision,
-    has_fast_bf16,
-    uses_bf16,
-)
+from torchrl_ficreg._device import autocast, bf16_speedup, describe_precision, has_fast_bf16, uses_bf16
 
 
 @pytest.fixture
@@ -90,12 +84,49 @@ def test_threads_that_ask_together_wait_for_one_measurement(unmeasured):
         assert later.submit(torch.get_num_threads).result() == threads
 
 
-def test_instructions_that_are_switched_off_are_noticed():
-    """oneDNN computes bfloat16 without the instructions too, slower than float32: ``auto`` is fp32 then."""
-    code = "from torchrl_ficreg._device import *; print(describe_precision('cpu'))"
+FAULTS = """
+import sys, torch
+from torchrl_ficreg._device import describe_precision, keep_freed_memory
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(8):
+        torch.ones(2**23)  # 32 MiB
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+if sys.platform == "linux":
+    import resource
+    known = keep_freed_memory(2**20, allow_decrease=True)
+    fresh = faults()
+    keep_freed_memory(2**31 - 1)
+    faults()
+    kept = faults()
+    keep_freed_memory(2**20)
+    print(int(known), fresh, kept, faults())
+print(describe_precision("cpu"))
+"""
+
+
+@pytest.fixture(scope="module")
+def said() -> list[str]:
+    """Lines of a process whose heap has no holes yet, and which has no instructions for bfloat16."""
     env = os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX512_CORE"}
-    said = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout
-    assert said.startswith("cpu, fp32 (") and "x in products" in said and "x in convolutions" in said
+    done = subprocess.run([sys.executable, "-c", FAULTS], env=env, capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()
+
+
+def test_instructions_that_are_switched_off_are_noticed(said):
+    """oneDNN computes bfloat16 without the instructions too, slower than float32: ``auto`` is fp32 then."""
+    assert said[-1].startswith("cpu, fp32 (") and "x in products" in said[-1] and "x in convolutions" in said[-1]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a setting of glibc")
+def test_freed_memory_is_reused_and_a_smaller_setting_does_not_undo_a_larger_one(said):
+    """Counted in page faults, one per page or huge page of fresh memory."""
+    known, fresh, kept, after_decrease = map(int, said[0].split())
+    if not known:
+        pytest.skip("another C library")
+    assert kept < fresh / 4 and after_decrease < fresh / 4
 
 
 @pytest.mark.parametrize("products, convolutions", [(2.0, 2.0), (10.0, 0.2), (0.4, 2.0)])
@@ -168,33 +199,3 @@ def test_a_vision_transformer_gives_the_same_latents_by_every_path(grad, chosen)
         latent = encoder(pixels=pixels).detach().float()
     tolerance = 1e-5 if chosen == "fp32" else 5e-2 * expected.abs().max().item()
     torch.testing.assert_close(latent, expected, rtol=0, atol=tolerance)
-
-
-FAULTS = """
-import resource, torch
-from torchrl_ficreg._device import keep_freed_memory
-
-def faults():
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(8):
-        torch.ones(2**23)  # 32 MiB
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-
-known = keep_freed_memory(2**20, allow_decrease=True)
-fresh = faults()
-keep_freed_memory(2**31 - 1)
-faults()
-kept = faults()
-keep_freed_memory(2**20)
-print(int(known), fresh, kept, faults())
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="a setting of glibc")
-def test_freed_memory_is_reused_and_a_smaller_setting_does_not_undo_a_larger_one():
-    """Counted in page faults, one per page or huge page of fresh memory, in a process whose heap has no holes yet."""
-    done = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True)
-    known, fresh, kept, after_decrease = map(int, done.stdout.split())
-    if not known:
-        pytest.skip("another C library")
-    assert kept < fresh / 4 and after_decrease < fresh / 4

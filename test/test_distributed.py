@@ -27,12 +27,7 @@ TIMES, DIM, DTYPE = 3, 5, torch.float64
 SIZES = {2: {"equal": [8, 8], "unequal": [3, 13]}, 4: {"equal": [4, 4, 4, 4], "unequal": [2, 5, 3, 6]}}
 STEPS = ("paper", "live", "trusted", "two_steps", "lewm", "joint", "pldm")  # losses that take a training step
 MASKED_STEPS = ("paper", "pldm")
-NORMS = {
-    "default": {},
-    "average": {"momentum": None},
-    "plain": {"affine": False},
-    "stateless": {"track_running_stats": False},
-}
+NORMS = {"default": {}, "average": {"momentum": None}, "plain": {"affine": False}, "stateless": {"track_running_stats": False}}
 
 
 def noise(*shape: int, seed: int = 0, dtype: torch.dtype = DTYPE) -> torch.Tensor:
@@ -155,7 +150,7 @@ def single():
 def ranks(request, tmp_path_factory):
     """Results of each rank on its local batch."""
     folder = str(tmp_path_factory.mktemp("ranks"))
-    mp.spawn(work, args=(request.param, folder), nprocs=request.param)
+    mp.start_processes(work, args=(request.param, folder), nprocs=request.param, start_method="forkserver")
     return [torch.load(f"{folder}/{rank}.pt", weights_only=False) for rank in range(request.param)]
 
 

@@ -102,7 +102,7 @@ def test_a_synonym_is_found(path, content):
     ("path", "content"),
     [
         ("a.py", 'judge = out["judge_r2_real"] // math.floor(judge)\n'),
-        ("a.py", '"""Writes ``judge_trust`` under consistency_target="judge", see :func:`judge_report`.\n\n>>> judge = 1\n"""\n'),
+        ("a.py", '"""Writes ``judge_trust``, consistency_target="judge", see :func:`judge_report`.\n\n>>> judge = 1\n"""\n'),
         ("a.yaml", "target: judge  # action (the paper) | judge (what is recovered)\n"),
         ("torchrl_ficreg/envs/cube/physics.py", "height = 0.02  # m, on the floor\n"),
         ("a.rst", "``judge_r2_real`` and second moments, evenly spread; floor_ratio.\n"),

@@ -1,15 +1,12 @@
-"""Files made by an earlier layout of the package, ``golden/first_layout.zip``, are read, continued and evaluated today.
+"""Files made by an earlier layout of the package, ``golden/first_layout.zip``, are read today.
 
 A run directory of two epochs, the dataset it was trained on and a pretrained folder, with the numbers that the model gave.
+test/sota/test_train_script.py continues and evaluates the run.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import shlex
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -18,7 +15,7 @@ import torch
 
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.pretrained import load_pretrained, save_pretrained
-from torchrl_ficreg.trainers import find_checkpoint, load_world_model
+from torchrl_ficreg.trainers import load_world_model
 
 HERE = Path(__file__).parent
 RUN, DATA = "runs/two_room_cpu_ficreg_seed0", "data/two_room_32px_20episodes_seed0"
@@ -63,28 +60,3 @@ def test_a_pretrained_folder_loads_and_is_written_again_to_the_bit(golden, tmp_p
     save_pretrained(model, tmp_path, inverse_model, card)
     for name in ("config.json", "model.safetensors"):
         assert (tmp_path / name).read_bytes() == (golden / "pretrained" / name).read_bytes()
-
-
-@pytest.mark.slow
-def test_the_run_is_continued_and_evaluated_by_the_scripts(golden):
-    """By the command that its README.txt notes: nothing is left to train, and the evaluation is repeated."""
-    checkpoint = find_checkpoint(golden / RUN).read_bytes()
-    (golden / RUN / "results.json").rename(golden / "results.json")
-    noted = next(line for line in (golden / RUN / "README.txt").read_text().splitlines() if "python train.py" in line)
-    scripts, environment = HERE.parent / "sota-implementations" / "ficreg", {**os.environ, "OMP_NUM_THREADS": "1"}
-    for line in (noted.split("python ")[1], f"evaluate.py checkpoint={RUN} record=0"):
-        script, *overrides = shlex.split(line)
-        done = subprocess.run(
-            [sys.executable, str(scripts / script), *overrides],
-            cwd=golden,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=240,
-        )
-        assert done.returncode == 0, done.stderr
-    assert find_checkpoint(golden / RUN).read_bytes() == checkpoint
-    before, after = (json.loads(path.read_text()) for path in (golden / "results.json", golden / RUN / "results.json"))
-    assert after["policy"]["pairs_hash"] == before["policy"]["pairs_hash"]
-    assert after["random"]["success_rate"] == before["random"]["success_rate"]
-    assert len(list((golden / RUN / "evaluation").iterdir())) == 1

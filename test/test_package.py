@@ -1,4 +1,4 @@
-"""Claims about the package as a whole: light to import, one-way imports, runnable examples, no loose ends."""
+"""Claims about the package as a whole: one-way imports, runnable examples, no loose ends."""
 
 from __future__ import annotations
 
@@ -6,10 +6,7 @@ import ast
 import doctest
 import importlib
 import importlib.util
-import inspect
 import pkgutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -37,8 +34,6 @@ ORDER = (
 )
 RANK = {name: rank for rank, row in enumerate(ORDER) for name in row}
 SIMULATORS = {"torchrl_ficreg.envs.cube": "ogbench", "torchrl_ficreg.envs.reacher": "dm_control"}
-HEAVY = "pymunk mujoco dm_control ogbench h5py hdf5plugin lance safetensors PIL".split()
-HEAVY += "wandb matplotlib imageio pygame transformers".split()
 
 
 def imports(tree: ast.AST) -> list[str]:
@@ -56,16 +51,6 @@ def calls(tree: ast.AST) -> list[ast.Call]:
     return [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
 
 
-def test_importing_the_losses_loads_no_simulator_and_no_plotting():
-    """Beyond what TorchRL loads itself: it looks for mujoco.mjx, and Python then imports mujoco."""
-    code = (
-        "import sys, torchrl.objectives; theirs = set(sys.modules); from torchrl_ficreg import FICRegLoss; "
-        f"print([n for n in {HEAVY} if n in sys.modules and n not in theirs])"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]", result.stdout
-
-
 @pytest.mark.parametrize("path", TREES)
 def test_imports_only_go_down(path):
     room = path.removesuffix(".py").split("/")[0]
@@ -76,6 +61,12 @@ def test_imports_only_go_down(path):
         target = name.split(".")[1]
         if target in RANK:  # else a name of the package itself
             assert target == room or RANK[target] < RANK[room] or RANK[room] == 0 == RANK[target], f"{path} imports {name}"
+
+
+def test_collectives_are_called_in_one_file():
+    """Elsewhere, a process without a process group would need a second way through."""
+    users = [path for path, tree in TREES.items() if any(name.startswith("torch.distributed") for name in imports(tree))]
+    assert users == ["distributed.py"]
 
 
 def test_every_room_is_on_the_plan():
@@ -90,16 +81,6 @@ def test_the_examples_in_docstrings_run(name):
             pytest.skip(f"{needed} is not installed: {how_to_install(needed)}")
     failed, _ = doctest.testmod(importlib.import_module(name))
     assert failed == 0
-
-
-@pytest.mark.parametrize("package", PACKAGES)
-def test_public_names_exist_and_are_explained(package):
-    module = importlib.import_module(package)
-    assert module.__doc__
-    for name in getattr(module, "__all__", []):
-        value = getattr(module, name)
-        if inspect.isclass(value) or inspect.isroutine(value):
-            assert value.__dict__.get("__doc__") if inspect.isclass(value) else value.__doc__, name
 
 
 @pytest.mark.parametrize("path", TREES)
@@ -118,26 +99,19 @@ def test_public_classes_functions_and_methods_are_explained(path):
 
 
 @pytest.mark.parametrize("path", TREES)
-def test_the_package_neither_prints_nor_asserts(path):
-    assert not [node.lineno for node in ast.walk(TREES[path]) if isinstance(node, ast.Assert)]
+def test_the_package_neither_prints_nor_asserts_and_annotations_are_lazy(path):
+    nodes = list(ast.walk(TREES[path]))
+    assert not [node.lineno for node in nodes if isinstance(node, ast.Assert)]
     assert not [call.lineno for call in calls(TREES[path]) if getattr(call.func, "id", None) == "print"]
-
-
-@pytest.mark.parametrize("path", TREES)
-def test_networks_borrow_weights_without_copying_them(path):
-    """tensordict's default would turn every frozen weight into a fresh trainable one."""
-    for call in calls(TREES[path]):
-        if isinstance(call.func, ast.Attribute) and call.func.attr == "to_module":
-            keyword = {word.arg: word.value for word in call.keywords}.get("preserve_module_state")
-            assert isinstance(keyword, ast.Constant), f"{path}:{call.lineno}"
-            assert keyword.value is False, f"{path}:{call.lineno}"
-
-
-@pytest.mark.parametrize("path", TREES)
-def test_annotations_are_lazy(path):
-    """``from __future__ import annotations`` on top of every file that annotates anything."""
-    annotated = [node for node in ast.walk(TREES[path]) if isinstance(node, (ast.FunctionDef, ast.AnnAssign))]
+    annotated = any(isinstance(node, (ast.FunctionDef, ast.AnnAssign)) for node in nodes)
     assert not annotated or "__future__.annotations" in imports(TREES[path])
+
+
+def test_networks_borrow_weights_without_copying_them():
+    """tensordict's default would turn every frozen weight into a fresh trainable one."""
+    borrows = [call for tree in TREES.values() for call in calls(tree) if getattr(call.func, "attr", None) == "to_module"]
+    keywords = [{word.arg: word.value for word in call.keywords}.get("preserve_module_state") for call in borrows]
+    assert keywords and [getattr(keyword, "value", None) for keyword in keywords] == [False] * len(keywords)
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=str)

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from _losses import TINY
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, LazyTensorStorage, ReplayBuffer, SliceSampler, Unbounded
 from torchrl.envs import Compose, DTypeCastTransform, EnvBase, InitTracker, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_ficreg import (
-    ActionBlocks,
-    CEMConfig,
-    FICRegLoss,
-    GoalImage,
-    LatentCEMPlanner,
-    make_world_model,
-    ModelConfig,
-    MPCPolicy,
-)
+from torchrl_ficreg import ActionBlocks, CEMConfig, FICRegLoss, GoalImage, LatentCEMPlanner, make_world_model, MPCPolicy
 from torchrl_ficreg.data import ActionStatistics, OfflineTrajectories
 
 STATISTICS = ActionStatistics(torch.tensor([0.1, -0.2]), torch.tensor([0.5, 2.0]))
@@ -55,12 +49,7 @@ class Plane(EnvBase):
         assert (action.abs() <= 1).all()
         position = tensordict["position"] + action
         done = position.abs().amax(-1, keepdim=True) >= self.border
-        step = {
-            "position": position,
-            "pixels": self.draw(position),
-            "reward": action.sum(-1, keepdim=True),
-            "done": done,
-        }
+        step = {"position": position, "pixels": self.draw(position), "reward": action.sum(-1, keepdim=True), "done": done}
         return TensorDict(step, tensordict.batch_size)
 
     def _set_seed(self, seed):
@@ -89,9 +78,7 @@ def steps_of(lengths, seed=0):
         done[-1] = True
         following = TensorDict({"pixels": pixels[1:], "reward": torch.randn(length, 1), "done": done}, [length])
         steps = {"pixels": pixels[:-1], "action": torch.randn(length, 2), "next": following}
-        episodes.append(
-            TensorDict({**steps, "episode": torch.full((length,), number), "step": torch.arange(length)}, [length])
-        )
+        episodes.append(TensorDict({**steps, "episode": torch.full((length,), number), "step": torch.arange(length)}, [length]))
     return torch.cat(episodes)
 
 
@@ -119,12 +106,7 @@ def test_clips_of_a_replay_buffer_are_those_of_our_own_dataset():
         pixels = torch.cat([rows["pixels"], rows["next", "pixels"][-1:]]).numpy()
         episodes.append({"pixels": pixels, "action": action, "state": np.zeros((len(action), 1))})
     dataset = OfflineTrajectories.from_episodes(
-        episodes,
-        split="all",
-        num_frames=4,
-        frame_skip=5,
-        keys=("pixels", "action", "episode", "step"),
-        statistics=STATISTICS,
+        episodes, split="all", num_frames=4, frame_skip=5, keys=("pixels", "action", "episode", "step"), statistics=STATISTICS
     )
     ours = {(int(clip["episode"][0]), int(clip["step"][0])): clip for clip in (dataset[i] for i in range(len(dataset)))}
     for clip in make_buffer(steps).sample():
@@ -163,16 +145,11 @@ def test_a_mask_of_the_steps_is_kept():
 
 def test_a_replay_buffer_feeds_the_loss():
     """Flat or as clips, the loss is the same; and it trains the encoder."""
-    config = ModelConfig(
-        encoder="conv", image_size=16, frame_skip=5, latent_dim=8, history=3, conv_channels=(4, 8), encoder_projector_dim=8,
-        predictor_width=8, predictor_depth=1, predictor_heads=1, predictor_dim_head=8, predictor_mlp_dim=8,
-        predictor_projector_dim=8, inverse_hidden_dim=8,
-    )  # fmt: skip
     steps = steps_of([60, 50])
     values = []
     for flat in (False, True):
         torch.manual_seed(0)
-        model, inverse_model = make_world_model(config, action_dim=2)
+        model, inverse_model = make_world_model(replace(TINY, frame_skip=5), action_dim=2)
         loss = FICRegLoss(model.encoder, model.predictor, inverse_model, num_frames=4)
         clips = make_buffer(steps, flat=flat).sample()
         assert clips.batch_size == ((32,) if flat else (8, 4))
@@ -192,24 +169,9 @@ def test_a_replay_buffer_feeds_the_loss():
         ({"frame_skip": 6}, None, ValueError, "20 steps are no whole number of blocks of frame_skip=6"),
         ({"num_frames": 3}, None, ValueError, r"20 steps are no slices of num_frames \* frame_skip = 15"),
         ({}, lambda steps: steps[0, 0], ValueError, r"needs a time dimension .* got batch size \[\]"),
-        (
-            {},
-            lambda steps: steps.set("action", torch.zeros(2, 20, 2, 2)),
-            ValueError,
-            "must be a vector .* flatten the action",
-        ),
-        (
-            {},
-            lambda steps: steps.set("action", torch.zeros(2, 20, 4)),
-            ValueError,
-            "describe 2 action dimensions, got 4",
-        ),
-        (
-            {},
-            lambda steps: steps.set("action", torch.zeros(2, 20, 2, dtype=torch.long)),
-            TypeError,
-            "floating-point actions",
-        ),
+        ({}, lambda steps: steps.set("action", torch.zeros(2, 20, 2, 2)), ValueError, "must be a vector .* flatten the action"),
+        ({}, lambda steps: steps.set("action", torch.zeros(2, 20, 4)), ValueError, "describe 2 action dimensions, got 4"),
+        ({}, lambda steps: steps.set("action", torch.zeros(2, 20, 2, dtype=torch.long)), TypeError, "floating-point actions"),
     ],
 )
 def test_unfit_batches_are_refused_in_one_line(settings, change, error, message):
@@ -225,9 +187,7 @@ def test_unfit_batches_are_refused_in_one_line(settings, change, error, message)
 @pytest.mark.parametrize("name", ENVS)
 @pytest.mark.parametrize("goal", [draw_goal, torch.zeros(3, 4, 4, dtype=torch.uint8)], ids=["drawn", "fixed"])
 def test_specs_are_right(name, goal):
-    env = TransformedEnv(
-        ENVS[name](), Compose(StepCounter(), ActionBlocks(4, STATISTICS), GoalImage(goal), InitTracker())
-    )
+    env = TransformedEnv(ENVS[name](), Compose(StepCounter(), ActionBlocks(4, STATISTICS), GoalImage(goal), InitTracker()))
     check_env_specs(env)
     assert env.action_spec.shape == (*env.batch_size, 8)
     low = STATISTICS.normalize(torch.tensor([-1.0, -1.0]).repeat(4)).expand(env.action_spec.shape)

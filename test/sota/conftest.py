@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import copy
+import functools
 import importlib
 import io
 import os
@@ -79,10 +81,12 @@ def execute() -> Callable[..., subprocess.CompletedProcess]:
         line, here, threads = [script, *with_tiny(script, overrides, tiny)], Path.cwd(), torch.get_num_threads()
         out, err = io.StringIO(), io.StringIO()
         main = importlib.import_module(script.removesuffix(".py")).main
+        # Hydra composes the configuration twice, first for hydra.mode, which is null.
+        quick_start = mock.patch("hydra._internal.hydra.Hydra.get_mode", return_value=None)
         os.chdir(folder)
         torch.set_num_threads(1)
         try:
-            with mock.patch.object(sys, "argv", line), mock.patch.dict(os.environ), warnings.catch_warnings():
+            with mock.patch.object(sys, "argv", line), mock.patch.dict(os.environ), warnings.catch_warnings(), quick_start:
                 with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
                     main()
             code = 0
@@ -98,10 +102,10 @@ def execute() -> Callable[..., subprocess.CompletedProcess]:
 
 @pytest.fixture
 def refused(execute, tmp_path) -> Callable[..., str]:
-    """``refused("train.py", "seed=-1")`` is the one line in which a script ends; it runs as the user typed it."""
+    """``refused("train.py", "seed=-1")`` is the one line in which a script ends; it runs as the user typed it, or tiny."""
 
-    def run(script: str, *overrides: str, folder: Path = tmp_path, code: int | None = None) -> str:
-        done = execute(folder, script, *overrides, tiny=False)
+    def run(script: str, *overrides: str, folder: Path = tmp_path, code: int | None = None, tiny: bool = False) -> str:
+        done = execute(folder, script, *overrides, tiny=tiny)
         (line,) = done.stderr.splitlines()
         assert line.startswith("error: ") and done.returncode in ((1, 2) if code is None else (code,)), done
         assert not done.stdout
@@ -115,11 +119,12 @@ def config() -> Callable[..., DictConfig]:
     """``config("train", "seed=1")`` is a composed configuration."""
     importlib.import_module("configs")  # the schemas
 
+    @functools.cache
     def compose(name: str, *overrides: str, **settings: bool) -> DictConfig:
         with hydra.initialize_config_dir(str(SCRIPTS / "config"), version_base="1.3"):
             return hydra.compose(name, list(overrides), **settings)
 
-    return compose
+    return lambda *arguments, **settings: copy.deepcopy(compose(*arguments, **settings))
 
 
 @pytest.fixture(scope="session")
@@ -146,8 +151,8 @@ def trained(trained_once) -> Path:
     return trained_once[0]
 
 
-@pytest.fixture
-def copy(trained, tmp_path) -> Path:
+@pytest.fixture(name="copy")
+def copy_of_trained(trained, tmp_path) -> Path:
     """A copy of it, to be changed."""
     return Path(shutil.copytree(trained, tmp_path / "copy"))
 

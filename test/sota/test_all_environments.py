@@ -10,11 +10,14 @@ import pytest
 from torchrl_ficreg.envs._gl import gl_works
 
 ACTION_DIM = {"push_t": 2, "reacher": 2, "cube": 5}
-EPISODES = 10
+EPISODES, STEPS = 10, 20
 SHORT = [
     f"env.data.episodes={EPISODES}",
-    "env.data.max_steps=30",
-    "env.budget=26",
+    f"env.data.max_steps={STEPS}",
+    "env.goal_offset=10",
+    "env.budget=11",
+    "plan.horizon=2",
+    "plan.receding_horizon=2",
     "evaluation.num_pairs=2",
     "evaluation.record=1",
     "refine.steps=20",
@@ -25,7 +28,7 @@ SHORT = [
 def test_the_whole_path(env, execute, tmp_path):
     if env != "push_t" and not gl_works():
         pytest.skip("MuJoCo has no GL to draw with: apt-get install libegl1 libgl1")
-    workers = 2 if env == "push_t" else 0  # processes are started in one of the three: they start slowly
+    workers = 2 if env == "push_t" else 0  # processes are started in one of the three
     done = execute(tmp_path, "train.py", f"env={env}", f"evaluation.num_workers={workers}", *SHORT)
     assert done.returncode == 0, done.stderr
     (run,) = (tmp_path / "runs").iterdir()
@@ -39,4 +42,4 @@ def test_the_whole_path(env, execute, tmp_path):
     header = json.loads((data / "meta.json").read_text())
     assert header["shapes"]["action"] == [ACTION_DIM[env]]
     lengths = [json.loads(line)["length"] for line in (data / "episodes.jsonl").read_text().splitlines()]
-    assert lengths == [31] * EPISODES, "episodes of these environments do not end at success"
+    assert lengths == [STEPS + 1] * EPISODES, "episodes of these environments do not end at success"

@@ -71,17 +71,12 @@ def test_two_slots_make_one_report(tmp_path):
     assert written == sorted(["ficreg_gpu.json", "log.txt", *pictures])
 
 
-def test_a_python_without_torch_is_refused(tmp_path):
-    bare = tmp_path / "python"
-    bare.write_text("#!/bin/sh\nexit 1\n")
+def test_a_python_without_torch_and_an_unknown_option_are_refused(tmp_path):
+    (bare := tmp_path / "python").write_text("#!/bin/sh\nexit 1\n")
     bare.chmod(0o755)
-    done = execute("--work", str(tmp_path / "w"), python=str(bare))
-    assert done.returncode == 2 and "has no torch" in done.stderr
-
-
-def test_an_unknown_option_is_refused(tmp_path):
-    done = execute("--wheel", str(tmp_path))
-    assert done.returncode == 2 and "unknown option --wheel" in done.stderr
+    for option, python, words in (("--work", str(bare), "has no torch"), ("--wheel", sys.executable, "unknown option --wheel")):
+        done = execute(option, str(tmp_path / "w"), python=python)
+        assert done.returncode == 2 and words in done.stderr
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])

@@ -17,11 +17,11 @@ SMALL += ["validation_rows=500"]
 
 
 @pytest.fixture(scope="module")
-def once(trained, spawn, files, tmp_path_factory):
+def once(trained, execute, files, tmp_path_factory):
     """A copy of the trained run, what it held before, and train_policy.py having run there."""
     folder = shutil.copytree(trained, tmp_path_factory.mktemp("policy") / "copy")
     before = files(folder)
-    return folder, before, spawn(folder, "train_policy.py", f"checkpoint={RUN}", *SMALL, tiny=False)
+    return folder, before, execute(folder, "train_policy.py", f"checkpoint={RUN}", *SMALL, tiny=False)
 
 
 def test_a_policy_appears_beside_the_run_and_nothing_else_changes(once, files):

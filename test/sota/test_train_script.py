@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import signal
 import subprocess
@@ -28,7 +29,7 @@ def weights(folder):
 
 def outcomes(folder):
     results = json.loads((folder / "results.json").read_text())
-    return {name: {k: v for k, v in row.items() if k != "seconds_per_plan"} for name, row in results.items() if name in ("policy", "random")}
+    return {name: {k: v for k, v in results[name].items() if k != "seconds_per_plan"} for name in ("policy", "random")}
 
 
 def test_a_run_leaves_exactly_the_documented_files(trained_once):
@@ -72,15 +73,14 @@ def test_the_same_command_elsewhere_gives_the_same_weights_and_outcomes(trained,
     assert outcomes(trained / RUN) == outcomes(tmp_path / RUN)
 
 
-def test_evaluate_repeats_the_outcome_bit_for_bit(trained, copy, spawn, files):
+def test_evaluate_repeats_the_outcome_bit_for_bit(trained, copy, execute, files):
     """The run's own plan settings, another number of environments; the run's own files stay as they are."""
     before = files(copy)
-    done = spawn(copy, "evaluate.py", f"checkpoint={RUN}", "num_envs=3", "record=1")
+    done = execute(copy, "evaluate.py", f"checkpoint={RUN}", "num_envs=3", "record=1")
     assert done.returncode == 0, done.stderr
     (folder,) = (copy / RUN / "evaluation").iterdir()
     repeated = json.loads((folder / "results.json").read_text())
     expected = outcomes(trained / RUN)
-    assert expected.keys() >= {"policy", "random"}
     for policy in ("policy", "random"):
         for key, value in expected[policy].items():
             assert repeated[policy][key] == value, (policy, key)
@@ -154,21 +154,18 @@ def test_resume_never_refuses_what_is_there_and_a_path_begins_from_it(trained, c
 def test_a_run_of_before_can_be_evaluated_and_continued(tmp_path, execute):
     """Made before modules and scripts were renamed: ``test/golden/first_layout.zip``."""
     shutil.unpack_archive(GOLDEN, tmp_path)
-    before = weights(tmp_path / RUN)
+    before = find_checkpoint(tmp_path / RUN).read_bytes()
     done = execute(tmp_path, "evaluate.py", f"checkpoint={RUN}", "record=0")
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / RUN / "evaluation").iterdir()
-    found = json.loads((folder / "results.json").read_text())["policy"]
-    expected = outcomes(tmp_path / RUN)["policy"]
-    assert {key: found[key] for key in ("pairs_hash", "first_success_step")} == {
-        key: expected[key] for key in ("pairs_hash", "first_success_step")
-    }
-    overrides = (tmp_path / RUN / "README.txt").read_text().split("python train.py ")[1].splitlines()[0].split()
+    found, expected = outcomes(folder), outcomes(tmp_path / RUN)
+    for policy in ("policy", "random"):
+        assert all(found[policy][key] == expected[policy][key] for key in ("pairs_hash", "first_success_step"))
+    overrides = shlex.split((tmp_path / RUN / "README.txt").read_text().split("python train.py ")[1].splitlines()[0])
     done = execute(tmp_path, "train.py", *overrides, tiny=False)
     assert done.returncode == 0, done.stderr
     assert "train:" not in done.stderr and "collect:" not in done.stderr
-    after = weights(tmp_path / RUN)
-    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert find_checkpoint(tmp_path / RUN).read_bytes() == before
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
@@ -176,8 +173,8 @@ def test_a_run_stopped_while_collecting_records_the_same_bytes_when_repeated(
     command, environment, execute, tmp_path, stop, files
 ):
     """Stopped after the first committed episodes, in the middle of recording; nothing else is running any more."""
-    many = "env.data.episodes=100"  # seconds of recording, so that it is not over before a busy machine looks again
-    data = DATA.replace("20episodes", "100episodes")
+    many = "env.data.episodes=60"  # seconds of recording, so that it is not over before a busy machine looks again
+    data = DATA.replace("20episodes", "60episodes")
     folder, whole = tmp_path / "stopped", tmp_path / "whole"
     folder.mkdir(), whole.mkdir()
     process = subprocess.Popen(
@@ -193,7 +190,7 @@ def test_a_run_stopped_while_collecting_records_the_same_bytes_when_repeated(
         time.sleep(0.001)
     process.send_signal(stop)
     _, err = process.communicate(timeout=60)
-    assert index.read_bytes().count(b"\n") < 100, "the recording was over too soon"
+    assert index.read_bytes().count(b"\n") < 60, "the recording was over too soon"
     assert process.returncode != 0
     if stop == signal.SIGINT:
         assert err.strip().endswith("interrupted: the same command continues from what is on disk.")
@@ -201,7 +198,7 @@ def test_a_run_stopped_while_collecting_records_the_same_bytes_when_repeated(
     for place in (folder, whole):
         done = execute(place, "collect.py", many)
         assert done.returncode == 0, done.stderr
-        assert "100 episodes" in done.stdout
+        assert "60 episodes" in done.stdout
     recorded = files(folder / data)
     assert recorded == files(whole / data)
     assert len(recorded) == 5  # three arrays, their index and the header

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from tiny import make_trainer, weights
+from tiny import make_trainer, same, weights
 from torchrl import torchrl_logger
 
 from torchrl_ficreg.trainers import OfflineTrainer
@@ -27,6 +28,21 @@ def finished(tmp_path_factory) -> tuple[Path, OfflineTrainer]:
 def unbroken(finished) -> dict[str, torch.Tensor]:
     """Weights of a run that was not interrupted."""
     return weights(finished[1])
+
+
+@pytest.fixture
+def continue_run(unbroken) -> Callable[..., OfflineTrainer]:
+    """``continue_run(run_dir, 9)`` resumes at step 9 and ends with the weights of a run that was not interrupted."""
+
+    def continue_run(run_dir: Path, step: int, start: Path | None = None, **settings) -> OfflineTrainer:
+        trainer = make_trainer(run_dir, **settings)
+        torch.manual_seed(123)  # dropout must not depend on what the new process drew
+        assert trainer.resume(start) and trainer.step == step
+        trainer.train()
+        assert same(weights(trainer), unbroken)
+        return trainer
+
+    return continue_run
 
 
 @pytest.fixture

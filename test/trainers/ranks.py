@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-from tiny import at_step, make_data, make_trainer, STILL, weights
+from tiny import fail_after, make_data, make_trainer, STILL, train_interrupted, weights
 
 from torchrl_ficreg import make_world_model
 from torchrl_ficreg.distributed import process_group
@@ -37,20 +37,6 @@ def make_pldm(run_dir: Path, rank: int, world_size: int = WORLD_SIZE) -> Offline
     trainer = OfflineTrainer(loss, make_data(rank=rank, world_size=world_size), run_dir=run_dir, **settings)
     CollapseMonitor(3, "fp32", trainer.metrics_table).register(trainer)
     return trainer
-
-
-def fail_after(step: int, trainer: OfflineTrainer, error: BaseException) -> None:
-    """Makes the trainer raise after a step."""
-    at_step(trainer, step, lambda: (_ for _ in ()).throw(error))
-
-
-def train_interrupted(trainer: OfflineTrainer, step: int) -> None:
-    """Trains until an exception after a step, on every rank. Checkpoints are written after steps 9, 18 and 27."""
-    fail_after(step, trainer, KeyboardInterrupt())
-    try:
-        trainer.train()
-    except KeyboardInterrupt:
-        pass
 
 
 def scenarios(folder: Path, rank: int) -> Iterator[tuple[str, Any]]:
@@ -107,7 +93,7 @@ def main(folder: Path, failing: int) -> None:
     with process_group(torch.device("cpu")):
         trainer = make_ranked(folder / "run", dist.get_rank(), sizes=STILL, epochs=1, validation_buffer=None)
         if dist.get_rank() == failing:
-            fail_after(5, trainer, OSError("injected"))
+            fail_after(trainer, 5, OSError("injected"))
         trainer.train()
     (folder / f"{os.environ['RANK']} done").touch()
 

@@ -35,7 +35,8 @@ def test_a_table_takes_new_columns_and_loses_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "damage", [b"2,train," + b"9" * 200_000, b"2,train,\xff\x00", b"two,train,0.5", b"9" * 5000 + b",train,0.5", b'2,"train', b"2"]
+    "damage",
+    [b"2,train," + b"9" * 200_000, b"2,train,\xff\x00", b"two,train,0.5", b"9" * 5000 + b",train,0.5", b'2,"train', b"2"],
 )
 def test_a_damaged_row_is_left_out_and_the_others_stay(tmp_path, damage):
     """A row of another step, a field of 200 kB, bytes that are no text, half a row."""
@@ -164,46 +165,56 @@ WANDB = """
 import importlib.util, os, signal, sys
 from pathlib import Path
 from tiny import make_trainer, weights
-import torch
+import torch, wandb
 from torchrl.record.loggers import get_logger
 from torchrl_ficreg.trainers import TolerantLogger
 
-here, number = Path.cwd(), signal.Signals[sys.argv[1]]
-logger = get_logger("wandb", logger_name=str(here), experiment_name="run", wandb_kwargs={"mode": "offline"})
-tolerant = TolerantLogger(logger, timeout=2)
-trainer = make_trainer(logger=tolerant, log_interval=1)
-tasks = Path(f"/proc/{os.getpid()}/task").glob("*/children")
-children = [int(pid) for file in tasks for pid in file.read_text().split()]
-service = [pid for pid in children if b"wandb" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-assert service
-trainer.register_op("post_steps", lambda: trainer.step == 5 and os.kill(service[0], number))
-(here / "service").write_text(str(service[0]))
-trainer.train()
-for name in ("sklearn", "torchvision", "transformers"):  # wandb would report them to its service
-    if importlib.util.find_spec(name):
-        importlib.import_module(name)
-tolerant.shutdown()  # waits for the service
-assert trainer.logger.lost
-torch.save(weights(trainer), here / "weights.pt")
+def lose_the_service(number):
+    logger = get_logger("wandb", logger_name=".", experiment_name="run", wandb_kwargs={"mode": "offline"})
+    tolerant = TolerantLogger(logger, timeout=2)
+    trainer = make_trainer(logger=tolerant, log_interval=1)
+    tasks = Path(f"/proc/{os.getpid()}/task").glob("*/children")
+    children = [int(pid) for file in tasks for pid in file.read_text().split()]
+    (service,) = [pid for pid in children if b"wandb" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    trainer.register_op("post_steps", lambda: trainer.step == 5 and os.kill(service, number))
+    Path("service").write_text(str(service))
+    trainer.train()
+    for name in ("sklearn", "torchvision", "transformers"):  # wandb would report them to its service
+        if importlib.util.find_spec(name):
+            importlib.import_module(name)
+    tolerant.shutdown()  # waits for the service
+    assert trainer.logger.lost
+    torch.save(weights(trainer), "weights.pt")
+
+runs = []
+for number in (signal.SIGKILL, signal.SIGSTOP):
+    runs.append(os.fork())
+    if not runs[-1]:
+        os.mkdir(number.name)
+        os.chdir(number.name)
+        said = os.open("said", os.O_WRONLY | os.O_CREAT)  # not a pipe, which the service would hold open
+        os.dup2(said, 1), os.dup2(said, 2)
+        lose_the_service(number)
+        break  # and ends as any process does
+else:
+    sys.exit(any([os.waitpid(run, 0)[1] for run in runs]))
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for the service below /proc")
-@pytest.mark.parametrize("number", ["SIGKILL", "SIGSTOP"])
-def test_a_run_outlives_the_service_of_wandb(tmp_path, unbroken, number):
-    """Killed or stopped in the middle, in a process of its own, where it can disturb nobody else; the process exits."""
+def test_a_run_outlives_the_service_of_wandb(tmp_path, unbroken):
+    """Killed or stopped in the middle, in processes of their own, where it can disturb nobody else; they exit."""
     pytest.importorskip("wandb")
     paths = os.pathsep.join([os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")])
     env = {**os.environ, "PYTHONPATH": paths, "WANDB_MODE": "offline", "WANDB_X_SERVICE_WAIT": "120"}
     env.pop("WANDB_SERVICE", None)  # of another test in this process
     try:
-        with open(tmp_path / "said", "w") as said:  # not a pipe, which the service would hold open
-            line = [sys.executable, "-c", WANDB, number]
-            done = subprocess.run(line, cwd=tmp_path, env=env, stdout=said, stderr=subprocess.STDOUT, timeout=120)
+        code = subprocess.run([sys.executable, "-c", WANDB], cwd=tmp_path, env=env, timeout=120).returncode
     finally:
-        with suppress(OSError, ValueError):
-            os.kill(int((tmp_path / "service").read_text()), signal.SIGKILL)
-    said = (tmp_path / "said").read_text()
-    assert done.returncode == 0, said
-    assert said.count("WandbLogger is lost") == 1
-    assert same(torch.load(tmp_path / "weights.pt"), unbroken)
+        for file in tmp_path.glob("*/service"):
+            with suppress(OSError, ValueError):
+                os.kill(int(file.read_text()), signal.SIGKILL)
+    for run in (tmp_path / "SIGKILL", tmp_path / "SIGSTOP"):
+        said = (run / "said").read_text()
+        assert code == 0 and said.count("WandbLogger is lost") == 1, said
+        assert same(torch.load(run / "weights.pt"), unbroken)

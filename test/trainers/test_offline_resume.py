@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny import at_step, damage, half_written, make_data, make_trainer, record, run, same, snapshot, weights
+from tiny import damage, half_written, make_data, make_trainer, record, run, same, snapshot, train_interrupted
 
 from torchrl_ficreg.data import OfflineTrajectories
 from torchrl_ficreg.trainers import load_world_model
@@ -34,21 +34,22 @@ def whole(tmp_path_factory):
 @pytest.fixture(scope="module")
 def start():
     """``start(run_dir, weights_file)`` begins a run in a process of its own; imports are done once, before the fork."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torchrl_ficreg.trainers"])
 
     def begin(*arguments: Path) -> multiprocessing.Process:
-        process = context.Process(target=run, args=arguments)
+        process = multiprocessing.get_context("forkserver").Process(target=run, args=arguments)
         process.start()
         return process
 
     return begin
 
 
-def finish(start, path: Path) -> None:
+def finish(start, path: Path, whole) -> None:
+    """The last start ends with the metrics and weights of the whole run."""
     process = start(path / "run", path / "weights.pt")
     process.join(120)
     assert process.exitcode == 0
+    assert losses(path / "run") == whole[0]
+    assert same(torch.load(path / "weights.pt"), whole[1])
 
 
 def published(run_dir: Path) -> set[str]:
@@ -73,11 +74,8 @@ def test_kills_at_random_times_change_no_bit(start, whole, tmp_path):
         process.join()
         if published(run_dir):
             load_world_model(run_dir)
-    finish(start, tmp_path)
-    metrics, final = whole
+    finish(start, tmp_path, whole)
     assert len(resumed_at(tmp_path)) >= 2
-    assert losses(run_dir) == metrics
-    assert same(torch.load(tmp_path / "weights.pt"), final)
 
 
 def test_kills_while_a_checkpoint_is_written_change_no_bit(start, whole, tmp_path):
@@ -94,11 +92,8 @@ def test_kills_while_a_checkpoint_is_written_change_no_bit(start, whole, tmp_pat
         if torn == 3:
             break
     assert torn == 3, "the parent never caught the child in the act"
-    finish(start, tmp_path)
-    metrics, final = whole
+    finish(start, tmp_path, whole)
     assert resumed_at(tmp_path)
-    assert losses(run_dir) == metrics
-    assert same(torch.load(tmp_path / "weights.pt"), final)
     assert not half_written(run_dir)
     load_world_model(run_dir)
 
@@ -120,21 +115,14 @@ def test_a_table_torn_by_a_kill_is_repaired(tmp_path, torn):
     assert [row["step"] for row in losses(tmp_path / "run")] == ["4", "8", "9", "9"]
 
 
-def test_resuming_restores_optimizer_schedule_random_state_and_position(tmp_path, unbroken):
+def test_resuming_restores_optimizer_schedule_random_state_and_position(tmp_path, continue_run):
     """After an exception between two checkpoints, the run continues from the first of them."""
-    broken = make_trainer(tmp_path)
-    at_step(broken, 14, lambda: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        broken.train()
+    train_interrupted(make_trainer(tmp_path), 14)
     again = make_trainer(tmp_path)
-    torch.manual_seed(123)  # dropout must not depend on what the new process drew
     assert again.resume()
-    assert again.step == 9
-    moments = [state["step"].item() for state in again.optimizer.state.values()]
-    assert moments == [9.0] * len(moments) and moments
+    assert {state["step"].item() for state in again.optimizer.state.values()} == {9.0}
     assert again.collector.replay_buffer.batches == 9
-    again.train()
-    assert same(weights(again), unbroken)
+    continue_run(tmp_path, 9)
 
 
 def test_other_data_or_networks_cannot_continue_a_run(run_dir):
@@ -155,42 +143,22 @@ def test_other_data_or_networks_cannot_continue_a_run(run_dir):
     assert make_trainer(run_dir).resume()
 
 
-def test_training_in_a_used_folder_without_resume_is_refused(run_dir, unbroken):
+def test_training_in_a_used_folder_without_resume_is_refused(run_dir, continue_run):
     """It would write every row twice and replace the checkpoints. Resumed, the finished run has nothing left to do."""
     before = snapshot(run_dir)
     trainer = make_trainer(run_dir)
     with pytest.raises(ValueError, match=r"holds checkpoints of a run: call resume\(\) .* another run_dir"):
         trainer.train()
     assert trainer.step == 0 and snapshot(run_dir) == before
-    trainer.resume()
-    trainer.train()
-    assert trainer.step == 27 and snapshot(run_dir) == before
-    assert same(weights(trainer), unbroken)
+    continue_run(run_dir, 27)
+    assert snapshot(run_dir) == before
 
 
-def test_a_run_may_begin_from_the_checkpoint_of_another(run_dir, tmp_path, unbroken):
+def test_a_run_may_begin_from_the_checkpoint_of_another(run_dir, tmp_path, continue_run):
     """It then writes checkpoints of its own, from which it is resumed."""
     earlier, _ = sorted((run_dir / "checkpoints").iterdir())
-    second = make_trainer(tmp_path / "second")
-    assert second.resume(earlier) and second.step == 18
-    second.train()
-    assert same(weights(second), unbroken)
-    again = make_trainer(tmp_path / "second")
-    assert again.resume(earlier) and again.step == 27
-
-
-@pytest.mark.parametrize("how", ["truncated", "flipped"])
-def test_a_run_goes_on_from_the_one_before_when_the_latest_is_damaged(run_dir, unbroken, warnings, how):
-    """Truncated or with other bytes: it is passed over with one warning, and the run ends with the same weights."""
-    earlier, latest = sorted((run_dir / "checkpoints").iterdir())
-    damage(latest, how)
-    again = make_trainer(run_dir)
-    assert again.resume() and again.step == 18
-    assert warnings == [f"{latest} is damaged: continuing from {earlier}."]
-    again.train()
-    assert again.step == 27
-    assert same(weights(again), unbroken)
-    assert make_trainer(run_dir).resume() and len(warnings) == 1  # the damaged file was replaced
+    for step in (18, 27):
+        continue_run(tmp_path / "second", step, earlier)
 
 
 @pytest.mark.parametrize("how", ["truncated", "flipped"])

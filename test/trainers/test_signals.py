@@ -28,40 +28,24 @@ def kill_in(trainer, step: int, *numbers: int) -> None:
     trainer.register_op("post_optim_log", kill)
 
 
-def test_sigterm_stops_after_the_step_in_progress_and_the_repeated_command_changes_no_bit(tmp_path, unbroken):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, PREEMPTED), (signal.SIGINT, 130)])
+def test_a_signal_stops_after_the_step_in_progress_and_the_repeated_command_changes_no_bit(
+    tmp_path, continue_run, foreground, number, code
+):
     """Sent in the middle of steps 5 and 14, which end no epoch; afterwards the former handler is back."""
-    handler = signal.getsignal(signal.SIGTERM)
+    handler = signal.getsignal(number)
     for stop_at in (5, 14):
         trainer = make_trainer(tmp_path)
         trainer.resume()
-        kill_in(trainer, stop_at, signal.SIGTERM)
-        with pytest.raises(Preempted, match="stopped by SIGTERM: the same command continues") as caught:
-            with stop_on_signal(trainer):
+        kill_in(trainer, stop_at, number)
+        with pytest.raises(Preempted, match=f"stopped by {number.name}: the same command continues") as caught:
+            with stop_on_signal(trainer, signal.SIGTERM, signal.SIGINT):
                 trainer.train()
-        assert caught.value.code == PREEMPTED == 85
+        assert caught.value.code == code and PREEMPTED == 85
         assert trainer.step == stop_at
-        assert signal.getsignal(signal.SIGTERM) is handler
-    again = make_trainer(tmp_path)
-    assert again.resume() and again.step == 14
-    with stop_on_signal(again):
-        again.train()
-    assert same(weights(again), unbroken)
+        assert signal.getsignal(number) is handler
+    continue_run(tmp_path, 14)
     assert logged_steps(tmp_path) == [4, 8, 12, 16, 20, 24, 27]
-
-
-def test_ctrl_c_writes_a_checkpoint_after_the_step_in_progress(tmp_path, unbroken, foreground):
-    """Its exit code is that of an interrupted command; the repeated one changes no bit."""
-    trainer = make_trainer(tmp_path)
-    kill_in(trainer, 5, signal.SIGINT)
-    with pytest.raises(Preempted, match="stopped by SIGINT: the same command continues") as caught:
-        with stop_on_signal(trainer, signal.SIGTERM, signal.SIGINT):
-            trainer.train()
-    assert caught.value.code == 130
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    again = make_trainer(tmp_path)
-    assert again.resume() and again.step == 5
-    again.train()
-    assert same(weights(again), unbroken)
 
 
 def test_a_second_ctrl_c_stops_at_once(tmp_path, foreground):
@@ -153,7 +137,6 @@ def test_a_signal_in_an_evaluation_has_its_usual_effect_outside_of_stop_on_signa
 def test_preempted_at_any_time_a_process_exits_with_85_and_its_steps_are_kept(tmp_path):
     """Three times at a random time. The last checkpoint has the weights of a run that took as many steps at once."""
     context, chance, reached = multiprocessing.get_context("forkserver"), random.Random(0), 0
-    context.set_forkserver_preload(["torchrl_ficreg.trainers"])
     for _ in range(3):
         process = context.Process(target=run_until_signalled, args=(tmp_path / "run",))
         process.start()

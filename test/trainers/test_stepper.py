@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from tiny import finite, make_data, make_trainer, same, SIZES, STILL, table, watch_updates, weights
+from tiny import make_data, make_trainer, same, SIZES, STILL, table, watch_updates, weights
 
 from torchrl_ficreg import make_world_model, ViTEncoder
 from torchrl_ficreg.modules import transformer
@@ -52,8 +52,11 @@ def poison(trainer, step: int, value: float) -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_loss_that_is_not_finite_stops_the_run_and_says_where(tmp_path, value):
-    """The message names the step, the terms and the last good checkpoint; no other weight has moved."""
+def test_a_loss_that_is_not_finite_stops_the_run_and_says_where(tmp_path, continue_run, value):
+    """The message names the step, the terms and the last good checkpoint, from which the run ends as it should.
+
+    No other weight has moved.
+    """
     trainer = make_trainer(tmp_path)
     poison(trainer, 12, value)
     kept = {}
@@ -70,8 +73,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_says_where(tmp_path, value)
         name for name, p in trainer.loss_module.named_parameters() if not torch.equal(p, kept[name]) and not p.isnan().any()
     ]
     assert not moved
-    again = make_trainer(tmp_path)
-    assert again.resume() and again.step == 9 and finite(weights(again))
+    continue_run(tmp_path, 9)
 
 
 def test_the_first_step_may_fail_too_and_without_a_checkpoint():
@@ -175,16 +177,17 @@ def test_parts_of_a_batch_give_the_mean_of_their_gradients():
 
 
 def test_a_compiled_step_learns_the_same(monkeypatch):
-    """Traced into one graph and run by autograd's own kernels; what a compiler makes of it is torch's affair."""
-    expected = weights_after(sizes=STILL)
+    """Traced into one graph and run by eager kernels; test_base_compile.py has larger losses and their backward pass."""
+    settings = {"sizes": STILL, "method": "lewm"}
+    expected = weights_after(**settings)
     compiled = []
 
     def compile(self, *args, **kwargs):
         compiled.append(self)
-        self._compiled_call_impl = torch.compile(self._call_impl, backend="aot_eager", fullgraph=True)
+        self._compiled_call_impl = torch.compile(self._call_impl, backend="eager", fullgraph=True)
 
     monkeypatch.setattr(torch.nn.Module, "compile", compile)
-    torch.testing.assert_close(weights_after(sizes=STILL, compile=True), expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(weights_after(**settings, compile=True), expected, rtol=1e-4, atol=1e-5)
     assert len(compiled) == 1
 
 

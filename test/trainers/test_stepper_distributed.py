@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
 import torch
+import torch.distributed.run
 from ranks import make_pldm, make_ranked, work, WORLD_SIZE
 from tiny import logged_steps, make_data, make_trainer, same, STILL, table, weights
 
@@ -34,7 +34,6 @@ def ranks(tmp_path_factory) -> tuple[Path, list[dict]]:
     """The folder of all runs on two ranks, and what each rank found."""
     folder = tmp_path_factory.mktemp("ranks")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torchrl_ficreg.trainers"])
     processes = [context.Process(target=work, args=(rank, folder)) for rank in range(WORLD_SIZE)]
     for process in processes:
         process.start()
@@ -180,32 +179,42 @@ def test_a_single_process_needs_no_process_group():
         assert any_rank(True) and not any_rank(False) and broadcast_from_rank0("x") == "x"
 
 
-def torchrun(folder: Path, failing: int) -> tuple[subprocess.CompletedProcess, float]:
-    """Runs ranks.py with two processes, of which one fails; and the seconds between its failure and the end."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+def launch(folder: Path, failing: int, output: Path) -> None:
+    """What the command torchrun does, in a process that has imported torch."""
+    for number, stream in enumerate((sys.stdout, sys.stderr), 1):
+        stream.flush()
+        os.dup2(os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND), number)
     script = Path(__file__).with_name("ranks.py")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(script.parents[2])}
-    done = subprocess.run(
-        [*command, str(script), str(folder), str(failing)], env=environment, capture_output=True, text=True, timeout=240
-    )
+    os.environ |= {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(script.parents[2])}
+    torch.distributed.run.main(["--standalone", "--nproc-per-node=2", str(script), str(folder), str(failing)])
+
+
+def torchrun(folder: Path, failing: int) -> tuple[int, str, float]:
+    """Runs ranks.py with two processes, of which one fails: exit code, output, seconds between failure and end."""
+    output = folder.with_name("output")
+    process = multiprocessing.get_context("forkserver").Process(target=launch, args=(folder, failing, output))
+    process.start()
+    process.join(240)
     metrics = folder / "run" / "metrics.csv"
-    return done, time.time() - metrics.stat().st_mtime
+    return process.exitcode, output.read_text(), time.time() - metrics.stat().st_mtime
 
 
 @pytest.mark.parametrize("failing", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_all_ranks_stop_within_seconds_when_one_fails(tmp_path, failing):
     """The last row of the table is from the step of the failure."""
-    done, seconds = torchrun(tmp_path, failing)
-    assert done.returncode not in (0, None)
-    assert "OSError: injected" in done.stderr
-    assert not [*tmp_path.glob("* done")]
-    assert logged_steps(tmp_path / "run") == [1, 2, 3, 4, 5]
+    (folder := tmp_path / "ranks").mkdir()
+    code, said, seconds = torchrun(folder, failing)
+    assert code not in (0, None)
+    assert "OSError: injected" in said
+    assert not [*folder.glob("* done")]
+    assert logged_steps(folder / "run") == [1, 2, 3, 4, 5]
     assert seconds < 20  # on a busy machine; about one otherwise
 
 
 def test_processes_that_torchrun_started_end_together(tmp_path):
-    done, _ = torchrun(tmp_path, failing=-1)
-    assert done.returncode == 0, done.stderr
-    assert {path.name for path in tmp_path.iterdir()} == {"0 done", "1 done", "run"}
-    assert {path.name for path in (tmp_path / "run").iterdir()} == {"checkpoints", "metrics.csv"}
-    assert make_ranked(tmp_path / "run", 0, 1, sizes=STILL, epochs=1, validation_buffer=None).resume()
+    (folder := tmp_path / "ranks").mkdir()
+    code, said, _ = torchrun(folder, failing=-1)
+    assert code == 0, said
+    assert {path.name for path in folder.iterdir()} == {"0 done", "1 done", "run"}
+    assert {path.name for path in (folder / "run").iterdir()} == {"checkpoints", "metrics.csv"}
+    assert make_ranked(folder / "run", 0, 1, sizes=STILL, epochs=1, validation_buffer=None).resume()

@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import zipfile
 
+import pytest
 import torch
 from tiny import make_data, make_trainer, snapshot
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from torchrl_ficreg import ActionBlocks
 from torchrl_ficreg.trainers import find_checkpoint
 from torchrl_ficreg.trainers.stream import ReplayStream
 
 
-def plain_buffer() -> ReplayBuffer:
-    """The clips of the tiny dataset in one of TorchRL's own buffers."""
+def plain_buffer(single_steps: bool = False, transform: ActionBlocks | None = None) -> ReplayBuffer:
+    """The clips of the tiny dataset, or their frames one by one, in one of TorchRL's own buffers."""
     data = make_data()
-    buffer = ReplayBuffer(storage=LazyTensorStorage(len(data)), batch_size=16)
-    buffer.extend(data[torch.arange(len(data))])
+    clips = data[torch.arange(len(data))]  # [N, T]
+    buffer = ReplayBuffer(storage=LazyTensorStorage(2 * len(data)), batch_size=16, transform=transform)
+    buffer.extend(clips.reshape(-1) if single_steps else clips)
     buffer.statistics = data.statistics
     return buffer
+
+
+@pytest.mark.parametrize("transform", [None, ActionBlocks(2), ActionBlocks(2, num_frames=2)])
+def test_a_buffer_of_single_steps_is_refused_whatever_makes_clips_of_them(transform):
+    with pytest.raises(ValueError, match=r"stores single steps \[N\], expected clips .*: extend it with slices") as caught:
+        make_trainer(data=plain_buffer(single_steps=True, transform=transform))
+    assert "\n" not in str(caught.value)
 
 
 def test_a_position_without_a_fingerprint_is_accepted():

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import csv
-import math
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -99,11 +99,6 @@ def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> boo
     return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
 
 
-def finite(tensors: dict[str, torch.Tensor]) -> bool:
-    """No NaN and no infinity anywhere."""
-    return all(math.isfinite(value.double().sum()) for value in tensors.values())
-
-
 def run(run_dir: Path, weights_file: Path) -> None:
     """One start of a command: continues after the last checkpoint, and saves the final weights."""
     trainer = make_trainer(run_dir, data=make_data(prefetch=1), epochs=6)
@@ -139,6 +134,18 @@ def logged_steps(run_dir: Path, split: str = "train") -> list[int]:
 def at_step(trainer: OfflineTrainer, step: int, action: Callable[[], object]) -> None:
     """Calls ``action`` after a step."""
     trainer.register_op("post_steps", lambda: action() if trainer.step == step else None)
+
+
+def fail_after(trainer: OfflineTrainer, step: int, error: BaseException) -> None:
+    """Makes the trainer raise after a step."""
+    at_step(trainer, step, lambda: (_ for _ in ()).throw(error))
+
+
+def train_interrupted(trainer: OfflineTrainer, step: int) -> None:
+    """Trains until an exception after a step. Checkpoints are written after steps 9, 18 and 27."""
+    fail_after(trainer, step, KeyboardInterrupt())
+    with suppress(KeyboardInterrupt):
+        trainer.train()
 
 
 def watch_updates(trainer: OfflineTrainer, what: Callable[[], object]) -> list:

@@ -200,7 +200,6 @@ def _latents(clip, value):
         (lambda c: c.set("pixels", c["pixels"].long()), TypeError, "uint8 .* or floating .* got torch.int64"),
         (lambda c: c.set("action", c["action"].long()), TypeError, "actions must be floating.* got torch.int64"),
         (lambda c: c.set("pixels", c["pixels"][..., :8]), ValueError, r"pixels must be \[..., 3, 16, 16\]"),
-        (lambda c: torch.cat([c, c], 1), ValueError, "takes 1 to 2 latents, got 5"),
         (lambda c: c.set("mask", torch.ones(8, 3, 2) > 0), ValueError, r"expected \[8, 3\] bool, got \[8, 3, 2\]"),
         (lambda c: TensorDict({**c, "mask": torch.ones(8, 1, dtype=torch.bool)}, [8]), ValueError, r"got \[8, 1\]"),
         (lambda c: c.set("mask", torch.ones(8, 3)), ValueError, "got .* torch.float32"),

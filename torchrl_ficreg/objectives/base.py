@@ -6,7 +6,8 @@ With B clips of T frames, latents of D and action blocks of F * A dimensions, ev
     read     _read       frames [B, T, 3, H, W], action [B, T - 1, F * A],            none
                          mask [B, T - 1]; checked: keys, shapes, dtypes, values
     encode   _encode     latents [B, T, D]                                            encoder
-    predict  _predict    predicted latents [B, T - 1, D] of frames 1 to T - 1         predictor, and its input latents
+    predict  _rollout    predicted latents [B, T - d, D] of frames d to T - 1, for    predictor, and its input latents
+                         every depth d up to prediction_steps
     recover  _recover    recovered actions [B, T - 1, F * A]                          inverse model, and its input latents
     terms    terms.py,   error of each transition [B, T - 1], or a statistic of all   as their inputs
              sigreg.py   latents []
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -47,6 +49,7 @@ from torchrl_ficreg.keys import (
 from torchrl_ficreg.modules.feed import choose_output, feed, read_output, require_module
 from torchrl_ficreg.modules.layers import check_finite, has_values
 from torchrl_ficreg.objectives.inverse_terms import Recovered
+from torchrl_ficreg.objectives.terms import squared_error
 
 Reduction = Literal["mean", "sum", "none"]
 
@@ -75,10 +78,13 @@ class LatentLoss(LossModule):
     Args:
         reduction ("mean", "sum" or "none"): over transitions.
         num_frames (int, optional): T of flat slices [B * T]. Default: ``None``, clips are [B, T].
+        prediction_steps (int, optional): k, depth of the rollouts of ``loss_pred``; see
+            :class:`~torchrl_ficreg.LeWMLoss`. Default: ``1``.
         **networks (TensorDictModule): by name, among ``encoder``, ``predictor`` and ``inverse_model``.
 
     Raises:
-        ValueError: an unknown reduction, ``num_frames`` below 2, or a network with another number of ``in_keys``.
+        ValueError: an unknown reduction, ``num_frames`` below 2, ``prediction_steps`` below 1, or a network with another
+            number of ``in_keys``.
         TypeError: a network that is no TensorDictModule.
     """
 
@@ -123,14 +129,20 @@ class LatentLoss(LossModule):
     target_inverse_model_params: TensorDictParams
 
     def __init__(
-        self, *, reduction: Reduction, num_frames: int | None = None, **networks: TensorDictModule
+        self,
+        *,
+        reduction: Reduction,
+        num_frames: int | None = None,
+        prediction_steps: int = 1,
+        **networks: TensorDictModule,
     ) -> None:
         super().__init__()
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"unknown reduction {reduction!r}: choose 'mean', 'sum' or 'none'.")
         if num_frames is not None and not (isinstance(num_frames, int) and num_frames >= 2):
             raise ValueError(f"num_frames must be a whole number of at least 2 frames, got {num_frames!r}.")
-        self.reduction, self.num_frames = reduction, num_frames
+        check_steps("prediction_steps", prediction_steps)
+        self.reduction, self.num_frames, self.prediction_steps = reduction, num_frames, prediction_steps
         self._networks = tuple(networks)
         for name, module in networks.items():
             require_module(name, module)
@@ -189,6 +201,7 @@ class LatentLoss(LossModule):
         """A clip in the dtype of the networks; raises what :func:`read_clip` does."""
         clip = read_clip(tensordict, self.tensor_keys, self.num_frames)
         self._check_size(clip)
+        self._check_depth(clip, "prediction_steps")
         if clip.latent is not None:
             dtype = next((param.dtype for param in self.predictor_params.parameters()), clip.latent.dtype)
             clip = clip._replace(latent=clip.latent.to(dtype))
@@ -224,17 +237,76 @@ class LatentLoss(LossModule):
             )
         return latent
 
+    def _check_depth(self, clip: Clip, name: str) -> None:
+        """Refuses clips that are too short for the depth that an attribute of the loss gives."""
+        steps, transitions = getattr(self, name), clip.action.shape[-2]
+        if steps > transitions:
+            raise ValueError(
+                f"{name}={steps} needs clips of {steps + 1} frames, got {transitions + 1}: sample longer clips (num_frames)."
+            )
+
+    def _rollout(
+        self, clip: Clip, latent: torch.Tensor, steps: int, params: TensorDictBase | None = None
+    ) -> list[torch.Tensor]:
+        """Predictions 1 to ``steps`` deep from every frame; those of depth d are [B, T - d, D], of frames d to T - 1.
+
+        As in planning, a rollout has a real context, here all frames of the clip up to its start, is fed with its own
+        predictions, and the predictor reads the last H of both. See :meth:`~torchrl_ficreg.LatentWorldModel.rollout`.
+
+        Args:
+            clip (Clip): the clip.
+            latent (torch.Tensor): [B, T, D].
+            steps (int): the largest depth.
+            params (TensorDictBase, optional): of the predictor, at depth 1. Default: ``None``, those of the loss, so that
+                running statistics move. Deeper predictions read these, as plans do, and leave them as they are.
+        """
+        action, frames = clip.action, latent.unbind(-2)  # T latents [B, D]
+        rollout = [self._predict(latent[..., :-1, :], action, self.predictor_params if params is None else params)]
+        if steps > 1:
+            # Copies, which the next forward pass leaves as they are: the backward pass of this one reads them.
+            params = with_own_buffers(self.predictor_params)
+            history = self._history("predictor", len(frames) - 1)
+            paths = [frames[: start + 1] for start in range(len(frames) - 1)]  # context and predictions of each start
+        for depth in range(2, steps + 1):
+            paths = [(*path, last) for path, last in zip(paths, rollout[-1].unbind(-2))][: len(frames) - depth]
+            # Short windows are filled up with frames that follow: a causal predictor does not see them.
+            windows = torch.stack([torch.stack((*path, *frames[len(path) : history])[-history:], -2) for path in paths])
+            first = [max(0, len(path) - history) for path in paths]
+            blocks = torch.stack([action[..., row : row + history, :] for row in first])  # [T - depth, B, H, F * A]
+            with running_statistics(self.__dict__["predictor"]):
+                predicted = self._predict(windows.flatten(0, -3), blocks.flatten(0, -3), params)  # [(T - depth) * B, H, D]
+            ends = [min(len(path), history) - 1 for path in paths]
+            rows = predicted.unflatten(0, windows.shape[:-2]).unbind(0)  # T - depth results [B, H, D]
+            last = [row[..., end, :] for row, end in zip(rows, ends)]
+            rollout.append(torch.stack(last, dim=-2))  # [B, T - depth, D]
+        return rollout
+
     def _predict(self, latent: torch.Tensor, action: torch.Tensor, params: TensorDictBase) -> torch.Tensor:
-        """Latents and action blocks [B, T - 1, ...] -> next latents [B, T - 1, D]."""
+        """Latents and action blocks [..., T, ...] -> next latents [..., T, D], each from the last H latents up to it."""
         if not in_autocast(latent.device):
             action = action.to(latent.dtype)  # networks may compute in another dtype than the data
-        return self._run("predictor", params, latent, action)[0]
+        length = self._history("predictor", latent.shape[-2])
+        inputs = _split(latent, length), _split(action, length)
+        return _join(self._run("predictor", params, *inputs)[0], latent.shape[:-1])
+
+    def _history(self, name: str, tokens: int) -> int:
+        """How many of so many latents a network reads at once: its attribute ``history`` if it has one, else all."""
+        history = getattr(self.__dict__[name], "history", None)
+        return tokens if history is None else min(history, tokens)
 
     def _recover(self, latent: torch.Tensor, next_latent: torch.Tensor, params: TensorDictBase) -> Recovered:
         """Latents and next latents [B, T - 1, D] -> the actions between them by the inverse model, [B, T - 1, F * A]."""
-        action, written = self._run("inverse_model", params, latent, next_latent)
+        length = self._history("inverse_model", latent.shape[-2])
+        inputs = _split(latent, length), _split(next_latent, length)
+        action, written = self._run("inverse_model", params, *inputs)
         log_var = written.get(self.tensor_keys.recovered_action_log_var, None)
-        return Recovered(action, log_var, written.get(self.tensor_keys.recovered_action_variance, None))
+        outputs = (action, log_var, written.get(self.tensor_keys.recovered_action_variance, None))
+        return Recovered(*(value if value is None else _join(value, latent.shape[:-1]) for value in outputs))
+
+    def _prediction(self, clip: Clip, latent: torch.Tensor, rollout: list[torch.Tensor]) -> torch.Tensor:
+        """Error of the predictions of :meth:`_rollout`, reduced; the error of a transition is its mean over depths."""
+        errors = [squared_error(predicted, latent[..., depth:, :]).mean(-1) for depth, predicted in enumerate(rollout, 1)]
+        return self._reduce(mean_over_depths(errors, clip.mask), clip.mask)
 
     def _reduce(self, term: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
         """[B, T - 1] -> [], or [B, T - 1] without reduction. Masked transitions are replaced, never multiplied, by zero.
@@ -491,6 +563,65 @@ def call(module: TensorDictModule, params: TensorDictBase, tensordict: TensorDic
 def with_own_buffers(params: TensorDictParams) -> TensorDictBase:
     """The same parameters with copies of the buffers: a second call in a step does not move BatchNorm statistics again."""
     return params.apply(lambda value: value if isinstance(value, nn.Parameter) else value.clone())
+
+
+@contextmanager
+def running_statistics(module: nn.Module) -> Iterator[None]:
+    """Context: BatchNorm layers in train mode normalise by their running statistics, which stay as they are."""
+    layers = [layer for layer in module.modules() if isinstance(layer, BatchNorm) and layer.training]
+    for layer in layers:
+        layer.training = False
+    try:
+        yield
+    finally:
+        for layer in layers:
+            layer.training = True
+
+
+def mean_over_depths(errors: list[torch.Tensor], mask: torch.Tensor | None) -> torch.Tensor:
+    """Mean error of every transition over the rollouts that reach it through unmasked transitions alone.
+
+    Args:
+        errors (list of torch.Tensor): of the predictions of depth d = 1, 2, ..., each [..., T - d]: rollouts of that depth
+            end with the transitions d - 1 to T - 2.
+        mask (torch.Tensor or None): [..., T - 1] bool, true where a transition counts.
+
+    Returns:
+        torch.Tensor: [..., T - 1]; any value where masked.
+    """
+    total = errors[0]
+    if len(errors) == 1:
+        return total
+    count, counts = torch.ones_like(total), mask
+    for depth, error in enumerate(errors[1:], 1):
+        if mask is not None:
+            counts = counts[..., 1:] & mask[..., :-depth]  # [..., T - 1 - depth], that the rollout from that start counts
+            error = torch.where(counts, error, 0.0)
+        reached = torch.ones_like(error) if mask is None else counts.to(error.dtype)
+        pad = (depth, 0)  # deep rollouts do not end with the first transitions
+        total, count = total + torch.nn.functional.pad(error, pad), count + torch.nn.functional.pad(reached, pad)
+    return total / count
+
+
+def check_steps(name: str, value: int) -> None:
+    """Refuses a depth of rollouts that is no positive whole number."""
+    if not (isinstance(value, int) and value >= 1):
+        raise ValueError(f"{name} must be a positive whole number, got {value}.")
+
+
+def _split(value: torch.Tensor, length: int) -> torch.Tensor:
+    """[..., T, C] -> all windows of so many rows, [(T - length + 1) * ..., length, C]; unchanged where T = length."""
+    if value.shape[-2] == length:
+        return value
+    return value.unfold(-2, length, 1).movedim(-3, 0).transpose(-1, -2).flatten(0, -3)
+
+
+def _join(windows: torch.Tensor, steps: torch.Size) -> torch.Tensor:
+    """Results for the windows of [..., T, D] -> [*steps, C], steps = [..., T]: all rows of the first, the last of the others."""
+    if windows.shape[:-1] == steps:
+        return windows
+    windows = windows.unflatten(0, (-1, *steps[:-1]))  # [T - length + 1, ..., length, C]
+    return torch.cat([windows[0], windows[1:, ..., -1, :].movedim(0, -2)], dim=-2)
 
 
 def zero_term(latent: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,14 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
 from torchrl_ficreg.distributed import all_gather
-from torchrl_ficreg.objectives.base import Clip, Reduction, takes_clip, with_own_buffers
+from torchrl_ficreg.objectives.base import (
+    check_steps,
+    Clip,
+    mean_over_depths,
+    Reduction,
+    takes_clip,
+    with_own_buffers,
+)
 from torchrl_ficreg.objectives.inverse_terms import (
     inverse_error,
     inverse_model_r2,
@@ -50,7 +57,7 @@ class FICRegLoss(LeWMLoss):
     weighted. All random draws of the baseline terms come first, so that under one seed the gradient of the encoder is
     bit-identical to that of :class:`LeWMLoss`.
 
-    The arguments from ``consistency`` on go beyond the paper; their defaults are the paper.
+    The arguments from ``prediction_steps`` on go beyond the paper; their defaults are the paper.
 
     Args:
         encoder (TensorDictModule): see :class:`LeWMLoss`.
@@ -64,6 +71,7 @@ class FICRegLoss(LeWMLoss):
         context ("detached" or "live", optional): input latents of the prediction, see above. Default: ``"detached"``.
         reduction ("mean", "sum" or "none", optional): see :class:`LeWMLoss`. Default: ``"mean"``.
         num_frames (int, optional): see :class:`LeWMLoss`. Default: ``None``.
+        prediction_steps (int, optional): see :class:`LeWMLoss`. Default: ``1``.
         consistency ("mse", "nll" or "trusted", optional): ``"mse"``, the squared error; ``"nll"``, the negative
             log-likelihood under a Gaussian inverse model; ``"trusted"``, the squared error weighted, for each sample and
             action dimension, by :func:`~torchrl_ficreg.objectives.inverse_terms.reliability_weight` of the real transition of
@@ -71,8 +79,9 @@ class FICRegLoss(LeWMLoss):
         consistency_target ("action" or "judge", optional): ``"action"``, the one taken; ``"judge"``, the one that the
             inverse model recovers from the *real* transition, so that predictions are not rewarded for holding more of the
             action than real latents do, as at walls and contacts. Default: ``"action"``.
-        consistency_steps (int, optional): k; the term also covers imagined transitions of rollouts 2 to k steps deep, which
-            are fed with predictions. Default: ``1``.
+        consistency_steps (int, optional): k; the term also covers the last transition of rollouts 2 to k steps deep. They are
+            the rollouts of ``prediction_steps``, with the same mean over depths, from detached latents unless
+            ``context="live"``. Default: ``1``.
         diagnostics (bool, optional): also write, detached, the results of
             :func:`~torchrl_ficreg.objectives.inverse_terms.inverse_model_r2` and ``judge_trust``, the mean reliability
             weight, each [F * A]. Default: ``False``.
@@ -111,6 +120,7 @@ class FICRegLoss(LeWMLoss):
         context: Literal["detached", "live"] = "detached",
         reduction: Reduction = "mean",
         num_frames: int | None = None,
+        prediction_steps: int = 1,
         consistency: Literal["mse", "nll", "trusted"] = "mse",
         consistency_target: Literal["action", "judge"] = "action",
         consistency_steps: int = 1,
@@ -123,14 +133,14 @@ class FICRegLoss(LeWMLoss):
             sigreg_coeff=sigreg_coeff,
             reduction=reduction,
             num_frames=num_frames,
+            prediction_steps=prediction_steps,
             inverse_model=inverse_model,
         )
         self._register_coefficients(idm_coeff=idm_coeff, consistency_coeff=consistency_coeff)
         _check_choice("context", context, ("detached", "live"))
         _check_choice("consistency", consistency, ("mse", "nll", "trusted"))
         _check_choice("consistency_target", consistency_target, ("action", "judge"))
-        if not (isinstance(consistency_steps, int) and consistency_steps >= 1):
-            raise ValueError(f"consistency_steps must be a positive whole number, got {consistency_steps}.")
+        check_steps("consistency_steps", consistency_steps)
         if consistency == "nll" and len(inverse_model.out_keys) < 2:
             raise self._no_likelihood()
         self.context, self.consistency, self.consistency_target = context, consistency, consistency_target
@@ -142,57 +152,49 @@ class FICRegLoss(LeWMLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms; see the class."""
         clip = self._read(tensordict)
+        self._check_depth(clip, "consistency_steps")
         latent = self._encode(clip)  # [B, T, D]; gradient for the encoder
-        predicted = self._predict(latent[..., :-1, :], clip.action, self.predictor_params)  # [B, T - 1, D]; for both
-        terms = self._baseline_terms(clip, latent, predicted)
-        real = latent.detach()  # no gradient for the encoder from here on, but through predicted in a live context
+        shares = self.context == "live" or clip.latent is not None  # given latents are detached already
+        depth = max(self.prediction_steps, self.consistency_steps if shares else 1)
+        rollout = self._rollout(clip, latent, depth)  # T - d predictions of every depth d; for encoder and predictor
+        terms = self._baseline_terms(clip, latent, rollout[: self.prediction_steps])
+        real = latent.detach()  # no gradient for the encoder from here on, but through the rollout in a live context
         recovered = self._recover(real[..., :-1, :], real[..., 1:, :], self.inverse_model_params)  # for the inverse model
         error = inverse_error(recovered, clip.action).mean(-1)  # [B, T - 1]
         terms["loss_idm"] = self.idm_coeff * self._reduce(error, clip.mask)
-        terms |= self._consistency_terms(clip, real, predicted, recovered.action.detach())
+        if not shares:
+            # With its own buffers: BatchNorm statistics move once a step.
+            rollout = self._rollout(clip, real, self.consistency_steps, with_own_buffers(self.predictor_params))
+        terms |= self._consistency_terms(clip, real, rollout, recovered.action.detach())
         return TensorDict(terms)
 
     def _consistency_terms(
-        self, clip: Clip, real: torch.Tensor, predicted: torch.Tensor, recovered: torch.Tensor
+        self, clip: Clip, real: torch.Tensor, rollout: list[torch.Tensor], recovered: torch.Tensor
     ) -> dict[str, torch.Tensor]:
         """``loss_consistency`` (gradient for the predictor only) and the detached diagnostics.
 
         Args:
             clip (Clip): the clip.
             real (torch.Tensor): [B, T, D], detached latents.
-            predicted (torch.Tensor): [B, T - 1, D], predictions from live latents, used in a live context.
+            rollout (list of torch.Tensor): predictions, from detached latents unless in a live context; see :meth:`_rollout`.
             recovered (torch.Tensor): [B, T - 1, F * A], detached actions recovered from real transitions.
         """
-        if clip.action.shape[-2] < self.consistency_steps:
-            raise ValueError(
-                f"consistency_steps={self.consistency_steps} needs clips of {self.consistency_steps + 1} frames, got "
-                f"{clip.action.shape[-2] + 1}: sample longer clips (num_frames)."
-            )
-        # With their own buffers: BatchNorm statistics of both networks move once a step, by real transitions alone.
+        # With its own buffers: BatchNorm statistics move once a step, by real transitions alone.
         frozen = with_own_buffers(self.inverse_model_params).detach()
-        params = with_own_buffers(self.predictor_params)
-        if self.context == "detached":
-            predicted = self._predict(real[..., :-1, :], clip.action, params)
         target = clip.action if self.consistency_target == "action" else recovered
         weight = self._weight(recovered, clip.action)
-        total, count = None, None
-        before, mask = real[..., :-1, :], clip.mask  # [B, T - 1, ...]
-        imagined_action = None
-        for step in range(self.consistency_steps):
-            if step:  # one step deeper, from one frame later
-                before = predicted[..., :-1, :].detach()
-                predicted = self._predict(predicted[..., :-1, :], clip.action[..., step:, :], params)
-                mask = None if mask is None else mask[..., 1:] & mask[..., :-1]
-            imagined = self._recover(before, predicted, frozen)  # [B, T - 1 - step, F * A]
-            imagined_action = imagined.action if imagined_action is None else imagined_action
-            error = self._consistency_error(imagined, target[..., step:, :], weight[..., step:, :]).mean(-1)
-            error, counted = _select(error, mask)
-            pad = (step, 0)  # deep steps do not reach transitions near the start
-            error, counted = (torch.nn.functional.pad(value, pad) for value in (error, counted))  # [B, T - 1]
-            total, count = (error, counted) if total is None else (total + error, count + counted)
-        terms = {"loss_consistency": self.consistency_coeff * self._reduce(total / count.clamp_min(1), clip.mask)}
+        errors, imagined_actions = [], []
+        before = real
+        for depth, predicted in enumerate(rollout[: self.consistency_steps]):  # [B, T - 1 - depth, D]
+            imagined = self._recover(before[..., :-1, :], predicted, frozen)  # [B, T - 1 - depth, F * A]
+            error = self._consistency_error(imagined, target[..., depth:, :], weight[..., depth:, :])
+            errors.append(error.mean(-1))
+            imagined_actions.append(imagined.action)
+            before = predicted.detach()
+        error = mean_over_depths(errors, clip.mask)  # [B, T - 1]
+        terms = {"loss_consistency": self.consistency_coeff * self._reduce(error, clip.mask)}
         if self.diagnostics:
-            terms |= inverse_model_r2(recovered, imagined_action, clip.action, clip.mask)
+            terms |= inverse_model_r2(recovered, imagined_actions[0], clip.action, clip.mask)
             mask = None if clip.mask is None else all_gather(clip.mask.flatten())  # [N of all ranks]
             terms["judge_trust"] = masked_mean(all_gather(weight.detach().float().flatten(0, -2)), mask)
         return terms
@@ -217,13 +219,6 @@ class FICRegLoss(LeWMLoss):
             f"consistency='nll' needs an inverse model that writes {self.tensor_keys.recovered_action_log_var!r}: use "
             "InverseDynamicsModel(kind='gaussian'), or name its output with loss.set_keys(recovered_action_log_var=...)."
         )
-
-
-def _select(error: torch.Tensor, mask: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
-    """Errors, zero where masked, and 1 where one counts; both [B, N]."""
-    if mask is None:
-        return error, torch.ones_like(error)
-    return torch.where(mask, error, 0.0), mask.to(error.dtype)
 
 
 def _check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:

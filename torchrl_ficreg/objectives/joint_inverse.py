@@ -41,6 +41,7 @@ class JointInverseLoss(LeWMLoss):
         idm_coeff (float, optional): mu; SMWM tunes it from 0.1 to 30 by task. Default: ``1.0``.
         reduction ("mean", "sum" or "none", optional): see :class:`~torchrl_ficreg.LeWMLoss`. Default: ``"mean"``.
         num_frames (int, optional): see :class:`~torchrl_ficreg.LeWMLoss`. Default: ``None``.
+        prediction_steps (int, optional): see :class:`~torchrl_ficreg.LeWMLoss`. Default: ``1``.
 
     Raises:
         KeyError, ValueError, TypeError: see :class:`~torchrl_ficreg.LeWMLoss`.
@@ -73,6 +74,7 @@ class JointInverseLoss(LeWMLoss):
         idm_coeff: float = 1.0,
         reduction: Reduction = "mean",
         num_frames: int | None = None,
+        prediction_steps: int = 1,
     ) -> None:
         super().__init__(
             encoder,
@@ -81,6 +83,7 @@ class JointInverseLoss(LeWMLoss):
             sigreg_coeff=sigreg_coeff,
             reduction=reduction,
             num_frames=num_frames,
+            prediction_steps=prediction_steps,
             inverse_model=inverse_model,
         )
         self._register_coefficients(idm_coeff=idm_coeff)
@@ -92,9 +95,9 @@ class JointInverseLoss(LeWMLoss):
         """Computes the terms; see the class."""
         clip = self._read(tensordict)
         latent = self._encode(clip)  # [B, T, D]; gradient for the encoder
-        predicted = self._predict(latent[..., :-1, :], clip.action, self.predictor_params)  # [B, T - 1, D]; for both
+        rollout = self._rollout(clip, latent, self.prediction_steps)  # for encoder and predictor
         recovered = self._recover(latent[..., :-1, :], latent[..., 1:, :], self.inverse_model_params)
-        terms = {"loss_pred": self._prediction(clip, latent, predicted)}
+        terms = {"loss_pred": self._prediction(clip, latent, rollout)}
         if self._compares_clips:
             terms["loss_sigreg"] = self.sigreg_coeff * self._regularizer(clip, latent)
         error = inverse_error(recovered, clip.action).mean(-1)  # [B, T - 1]

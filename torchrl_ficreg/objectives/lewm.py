@@ -8,7 +8,6 @@ from tensordict.nn import TensorDictModule
 
 from torchrl_ficreg.objectives.base import Clip, LatentLoss, Reduction, takes_clip, zero_term
 from torchrl_ficreg.objectives.sigreg import SIGReg
-from torchrl_ficreg.objectives.terms import squared_error
 
 
 class LeWMLoss(LatentLoss):
@@ -24,6 +23,23 @@ class LeWMLoss(LatentLoss):
     ``loss_pred``         yes      yes
     ``loss_sigreg``       yes      no
     ====================  =======  =========
+
+    With ``prediction_steps`` = k, predictions are up to k steps deep. A rollout starts from every frame s, as in planning: its
+    context are the real latents up to s, then it is fed with its own predictions, and the predictor reads the last H of both, H
+    its attribute ``history`` (all, if it has none). With :math:`\hat z^{(d)}_t` the prediction of latent t, d steps deep, from
+    s = t - d,
+
+    .. math:: L_{pred} = \frac{1}{T - 1} \sum_{t=1}^{T-1} \frac{1}{\min(k, t)} \sum_{d=1}^{\min(k, t)}
+              \|\hat z^{(d)}_t - z_t\|^2
+
+    (means over dimensions). The table holds for every depth: gradient flows through all d steps to the predictor
+    (backpropagation through time), and to the encoder through the context and the target. With a mask, a prediction counts if
+    all transitions from s to t do, and the inner mean is over those. Clips need k + 1 frames; with H + k, a rollout of k steps starts from a
+    whole history. They may be longer than H + 1 frames for any k.
+
+    In train mode, BatchNorm layers of the predictor normalise by the batch at depth 1, where their running statistics move, and
+    by the running statistics at greater depth, as in planning. Normalised by the batch, a shift or a scale that all deep
+    predictions share would not reach the loss.
 
     Reads a clip [B, T]:
 
@@ -59,12 +75,14 @@ class LeWMLoss(LatentLoss):
         reduction ("mean", "sum" or "none", optional): over transitions; the regularizer is [] in any case. Default: ``"mean"``.
         num_frames (int, optional): T of flat slices [B * T], as a ``SliceSampler`` samples them. Default: ``None``, clips are
             [B, T].
+        prediction_steps (int, optional): k, depth of the deepest rollouts, see above. Default: ``1``, the paper.
         **networks (TensorDictModule): further networks of a subclass.
 
     Raises:
         KeyError: the clip lacks a key.
-        ValueError: an unknown reduction, a negative coefficient, networks whose inputs cannot be told apart, a clip of one
-            frame, a batch of one clip, clips that go on after ``("next", "done")``, or widths that do not fit the networks.
+        ValueError: an unknown reduction, a negative coefficient, ``prediction_steps`` below 1, networks whose inputs cannot be
+            told apart, a clip of fewer than ``prediction_steps`` + 1 frames, a batch of one clip, clips that go on after
+            ``("next", "done")``, or widths that do not fit the networks.
         TypeError: pixels that are neither uint8 nor floating, a plain dict instead of a tensordict, or a network that is no
             TensorDictModule.
 
@@ -95,9 +113,17 @@ class LeWMLoss(LatentLoss):
         sigreg_coeff: float = 0.09,
         reduction: Reduction = "mean",
         num_frames: int | None = None,
+        prediction_steps: int = 1,
         **networks: TensorDictModule,
     ) -> None:
-        super().__init__(reduction=reduction, num_frames=num_frames, encoder=encoder, predictor=predictor, **networks)
+        super().__init__(
+            reduction=reduction,
+            num_frames=num_frames,
+            prediction_steps=prediction_steps,
+            encoder=encoder,
+            predictor=predictor,
+            **networks,
+        )
         self.sigreg = SIGReg() if sigreg is None else sigreg
         self._register_coefficients(sigreg_coeff=sigreg_coeff)
 
@@ -106,19 +132,17 @@ class LeWMLoss(LatentLoss):
         """Computes the terms; see the class."""
         clip = self._read(tensordict)
         latent = self._encode(clip)  # [B, T, D]; gradient for the encoder
-        predicted = self._predict(latent[..., :-1, :], clip.action, self.predictor_params)  # [B, T - 1, D]; for both
-        return TensorDict(self._baseline_terms(clip, latent, predicted))
+        rollout = self._rollout(clip, latent, self.prediction_steps)  # gradient for both
+        return TensorDict(self._baseline_terms(clip, latent, rollout))
 
-    def _baseline_terms(self, clip: Clip, latent: torch.Tensor, predicted: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _baseline_terms(
+        self, clip: Clip, latent: torch.Tensor, rollout: list[torch.Tensor]
+    ) -> dict[str, torch.Tensor]:
         """``loss_pred`` (gradient for encoder and predictor) and ``loss_sigreg`` (for the encoder only)."""
         return {
-            "loss_pred": self._prediction(clip, latent, predicted),
+            "loss_pred": self._prediction(clip, latent, rollout),
             "loss_sigreg": self.sigreg_coeff * self._regularizer(clip, latent),
         }
-
-    def _prediction(self, clip: Clip, latent: torch.Tensor, predicted: torch.Tensor) -> torch.Tensor:
-        """Error of predictions [B, T - 1, D], reduced."""
-        return self._reduce(squared_error(predicted, latent[..., 1:, :]).mean(-1), clip.mask)
 
     def _regularizer(self, clip: Clip, latent: torch.Tensor) -> torch.Tensor:
         """The regularizer [] on the unmasked latents [B, T, D]; zero, without a draw, where they were given."""

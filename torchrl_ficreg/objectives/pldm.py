@@ -68,6 +68,7 @@ class PLDMLoss(LatentLoss):
         std_margin (float, optional): standard deviation below which a dimension is penalised. Default: ``1.0``.
         reduction ("mean", "sum" or "none", optional): over transitions; the statistics are [] in any case. Default: ``"mean"``.
         num_frames (int, optional): see :class:`~torchrl_ficreg.LeWMLoss`. Default: ``None``.
+        prediction_steps (int, optional): see :class:`~torchrl_ficreg.LeWMLoss`. Default: ``1``.
 
     Raises:
         KeyError, ValueError, TypeError: see :class:`~torchrl_ficreg.LeWMLoss`.
@@ -106,10 +107,12 @@ class PLDMLoss(LatentLoss):
         std_margin: float = 1.0,
         reduction: Reduction = "mean",
         num_frames: int | None = None,
+        prediction_steps: int = 1,
     ) -> None:
         super().__init__(
             reduction=reduction,
             num_frames=num_frames,
+            prediction_steps=prediction_steps,
             encoder=encoder,
             predictor=predictor,
             inverse_model=inverse_model,
@@ -135,12 +138,12 @@ class PLDMLoss(LatentLoss):
         clip = self._read(tensordict)
         latent = self._encode(clip)  # [B, T, D]; gradient for the encoder
         before, after = latent[..., :-1, :], latent[..., 1:, :]
-        predicted = self._predict(before, clip.action, self.predictor_params)  # [B, T - 1, D]; for both
+        rollout = self._rollout(clip, latent, self.prediction_steps)  # for encoder and predictor
         compute = self._latent_terms(clip, latent, before, after)
         compute["loss_idm"] = lambda: self._reduce(
             inverse_error(self._recover(before, after, self.inverse_model_params), clip.action).mean(-1), clip.mask
         )
-        terms = {"loss_pred": self._reduce(squared_error(predicted, after).mean(-1), clip.mask)}
+        terms = {"loss_pred": self._prediction(clip, latent, rollout)}
         for key in self.out_keys[1:]:
             weight: torch.Tensor = getattr(self, key.replace("loss_", "") + "_coeff")
             terms[key] = weight * compute[key]()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -57,11 +56,3 @@ def warnings(monkeypatch) -> list[str]:
     texts = []
     monkeypatch.setattr(torchrl_logger, "warning", lambda text, *_: texts.append(text))
     return texts
-
-
-@pytest.fixture
-def foreground():
-    """SIGINT as in a foreground job: one that a shell runs in the background ignores it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)

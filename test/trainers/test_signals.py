@@ -29,9 +29,7 @@ def kill_in(trainer, step: int, *numbers: int) -> None:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, PREEMPTED), (signal.SIGINT, 130)])
-def test_a_signal_stops_after_the_step_in_progress_and_the_repeated_command_changes_no_bit(
-    tmp_path, continue_run, foreground, number, code
-):
+def test_a_signal_stops_after_the_step_and_the_repeated_command_changes_no_bit(tmp_path, continue_run, number, code):
     """Sent in the middle of steps 5 and 14, which end no epoch; afterwards the former handler is back."""
     handler = signal.getsignal(number)
     for stop_at in (5, 14):
@@ -48,7 +46,7 @@ def test_a_signal_stops_after_the_step_in_progress_and_the_repeated_command_chan
     assert logged_steps(tmp_path) == [4, 8, 12, 16, 20, 24, 27]
 
 
-def test_a_second_ctrl_c_stops_at_once(tmp_path, foreground):
+def test_a_second_ctrl_c_stops_at_once(tmp_path):
     """In the middle of step 5, so that no checkpoint is written. SIGTERM may come any number of times."""
     trainer = make_trainer(tmp_path)
     kill_in(trainer, 5, signal.SIGTERM, signal.SIGTERM, signal.SIGINT, signal.SIGINT)
@@ -59,10 +57,11 @@ def test_a_second_ctrl_c_stops_at_once(tmp_path, foreground):
     assert not list((tmp_path / "checkpoints").glob("checkpoint-*"))
 
 
-def test_a_background_job_goes_on_ignoring_ctrl_c(foreground):
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def test_a_background_job_goes_on_ignoring_ctrl_c():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     with stop_on_signal(make_trainer(), signal.SIGTERM, signal.SIGINT):
         os.kill(os.getpid(), signal.SIGINT)
+    assert signal.signal(signal.SIGINT, before) is signal.SIG_IGN
 
 
 def evaluating(run_dir, evaluate) -> tuple:
@@ -74,7 +73,7 @@ def evaluating(run_dir, evaluate) -> tuple:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 85), (signal.SIGINT, 130)])
-def test_a_signal_ends_an_evaluation_at_once_and_the_epoch_is_kept(tmp_path, unbroken, foreground, number, code):
+def test_a_signal_ends_an_evaluation_at_once_and_the_epoch_is_kept(tmp_path, unbroken, number, code):
     """The evaluation of step 18 would never end. The run stops there with a checkpoint, and ends as it should."""
     finally_ran = []
 
@@ -121,7 +120,7 @@ def test_an_evaluation_does_not_begin_when_a_signal_came_in_its_step(tmp_path):
     assert asked == ["hook"]
 
 
-def test_a_signal_in_an_evaluation_has_its_usual_effect_outside_of_stop_on_signal(tmp_path, foreground):
+def test_a_signal_in_an_evaluation_has_its_usual_effect_outside_of_stop_on_signal(tmp_path):
     """Ctrl-C in a notebook, for example: KeyboardInterrupt, with the networks back in train mode."""
 
     def evaluate(trainer) -> dict[str, float]:

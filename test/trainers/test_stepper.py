@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from tiny import make_data, make_trainer, same, SIZES, STILL, table, watch_updates, weights
+from tiny import make_data, make_trainer, SIZES, STILL, table, watch_updates, weights
 
 from torchrl_ficreg import make_world_model, ViTEncoder
 from torchrl_ficreg.modules import transformer
@@ -21,21 +21,6 @@ def test_gradients_are_clipped_to_the_norm_and_the_norm_before_clipping_is_repor
     trainer.train()
     assert norms == pytest.approx([0.01] * 27, rel=1e-3)
     assert min(float(row["grad_norm"]) for row in table(tmp_path)) > 0.1
-
-
-def test_the_objective_is_the_plain_sum_of_the_terms():
-    """One plain AdamW step by hand, from the same seed, lands on the same weights."""
-    trainer, by_hand = make_trainer(validate=False), make_trainer(validate=False)
-    trainer.request_stop()
-    torch.manual_seed(5)
-    trainer.train()
-    assert trainer.step == 1
-    torch.manual_seed(5)
-    loss, optimizer = by_hand.loss_module, by_hand.optimizer
-    sum(loss(make_data().sample()).values()).backward()
-    torch.nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], 1.0)
-    optimizer.step()
-    assert same(weights(trainer), weights(by_hand))
 
 
 def poison(trainer, step: int, value: float) -> None:
@@ -79,14 +64,8 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_says_where(tmp_path, contin
 def test_the_first_step_may_fail_too_and_without_a_checkpoint():
     trainer = make_trainer()
     poison(trainer, 1, math.nan)
-    with pytest.raises(FloatingPointError, match="step 1: not finite: .*; there is no checkpoint yet"):
+    with pytest.raises(FloatingPointError, match="step 1: not finite: .*; there is no checkpoint yet. Try a smaller learning"):
         trainer.train()
-
-
-def test_a_huge_learning_rate_is_stopped_not_followed():
-    """Weights blown up by lr = 1e30 end the run in words instead of training on NaN."""
-    with pytest.raises(FloatingPointError, match="Try a smaller learning rate"):
-        make_trainer(lr=1e30, warmup=0).train()
 
 
 def test_bf16_trains_to_about_the_same_losses_and_keeps_float32_weights(tmp_path):
@@ -156,22 +135,22 @@ def test_networks_without_transformer_blocks_cannot_be_switched():
         checkpoint_activations(torch.nn.Linear(2, 2))
 
 
-def test_parts_of_a_batch_give_the_mean_of_their_gradients():
-    """One update from two parts is AdamW on the mean of their gradients; dropout is off, SIGReg draws for each part."""
-    trainer = make_trainer(epochs=1, validate=False, accumulate=2, sizes=STILL)
-    loss, clips = copy.deepcopy(trainer.loss_module), make_data()
-    batch = clips.sample()
+@pytest.mark.parametrize("parts", [1, 2])
+def test_a_step_is_adamw_on_the_mean_of_the_gradients_of_the_parts_of_a_batch(parts):
+    """The objective is the plain sum of the terms. Dropout is off, SIGReg draws for each part."""
+    trainer = make_trainer(epochs=1, validate=False, accumulate=parts, sizes=STILL)
+    loss, batch = copy.deepcopy(trainer.loss_module), make_data().sample()
     params = [p for p in loss.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(params, lr=trainer.optimizer.param_groups[0]["lr"], weight_decay=1e-3)
     outputs = []
-    for part in batch.chunk(2):
+    for part in batch.chunk(parts):
         outputs.append(loss(part))
-        (sum(outputs[-1].values()) / 2).backward()
+        (sum(outputs[-1].values()) / parts).backward()
     torch.nn.utils.clip_grad_norm_(params, 1.0)
     optimizer.step()
     found = trainer.optimization_stepper.step(trainer, batch)
     for name in outputs[0].keys():
-        torch.testing.assert_close(found[name], (outputs[0][name] + outputs[1][name]).detach() / 2)
+        torch.testing.assert_close(found[name], sum(output[name] for output in outputs).detach() / parts)
     ours = [p for p in trainer.loss_module.parameters() if p.requires_grad]
     torch.testing.assert_close(ours, params, rtol=1e-5, atol=1e-6)
 

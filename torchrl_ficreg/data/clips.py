@@ -13,9 +13,9 @@ from torchrl.data.replay_buffers import Storage
 
 from torchrl_ficreg.data.action_statistics import ActionStatistics
 from torchrl_ficreg.data.store import EpisodeStore
-from torchrl_ficreg.keys import ACTION, EPISODE, MASK, PIXELS, STATE, STEP
+from torchrl_ficreg.keys import ACTION, EPISODE, LATENT, MASK, PIXELS, STATE, STEP
 
-CLIP_KEYS = (PIXELS, ACTION, STATE, EPISODE, STEP)
+CLIP_KEYS = (PIXELS, ACTION, STATE, EPISODE, STEP, LATENT)
 
 
 class ClipStorage(TensorStorage):
@@ -44,15 +44,17 @@ class ClipStorage(TensorStorage):
         frame_skip (int): F, environment steps from one frame to the next.
         keys (sequence of str, optional): what a clip holds: ``pixels`` uint8 [T, 3, H, W], ``action`` float32
             [T, F * A] (and with it ``mask`` bool [T]), ``state`` float64 [T, S], ``episode`` int64 [T], ``step``
-            int64 [T]. Default: ``("pixels", "action")``.
+            int64 [T], and, with ``latent`` below, ``latent`` float32 [T, D]. Default: ``("pixels", "action")``.
         statistics (ActionStatistics, optional): z-scores the actions. Default: ``None``, environment units.
+        latent (Tensor, optional): latents of all rows of these episodes, float32 [N, D], episode after episode; see
+            :func:`~torchrl_ficreg.data.encode_episodes`. Default: ``None``.
 
     Attributes:
         num_short_episodes: number of episodes that are shorter than a clip.
 
     Raises:
-        KeyError: an unknown key, or none.
-        ValueError: no episode is long enough for a clip, or T or F is not positive.
+        KeyError: an unknown key, none, or ``latent`` without latents.
+        ValueError: no episode is long enough for a clip, T or F is not positive, or the latents belong to other rows.
 
     Examples:
         >>> step = np.arange(12)
@@ -79,16 +81,21 @@ class ClipStorage(TensorStorage):
         frame_skip: int,
         keys: Sequence[str] = (PIXELS, ACTION),
         statistics: ActionStatistics | None = None,
+        latent: torch.Tensor | None = None,
     ) -> None:
         if num_frames < 1 or frame_skip < 1:
             raise ValueError(f"num_frames and frame_skip must be positive, got {num_frames} and {frame_skip}.")
         if not keys or not set(keys) <= set(CLIP_KEYS):
             raise KeyError(f"a clip holds some of {CLIP_KEYS}, got keys={tuple(keys)}.")
+        if LATENT in keys and latent is None:
+            raise KeyError("clips hold latents only if they are given: latent=encode_episodes(dataset, encode).")
         if STATE in keys:
             store.require_state()
         self.store, self.statistics, self.keys = store, statistics, tuple(keys)
         self.num_frames, self.frame_skip = num_frames, frame_skip
         episodes = np.asarray(episodes, dtype=np.int64)
+        if latent is not None:
+            self._latent, self._latent_row = _check_latents(latent, store, episodes)
         starts = store.length[episodes - 1] - clip_length(num_frames, frame_skip) + 1  # [E] legal starts of each
         self._episode = episodes[starts > 0]
         self._stop_clip = np.cumsum(starts[starts > 0])  # [E], one past the last clip number of each
@@ -137,6 +144,9 @@ class ClipStorage(TensorStorage):
                 clip[key] = torch.from_numpy(frame - self.store.start[episode - 1][..., None])
             elif key == PIXELS:
                 clip[key] = torch.from_numpy(self.store.frames(frame))  # [B..., T, 3, H, W]
+            elif key == LATENT:
+                row = self._latent_row[episode - 1][..., None] + frame - self.store.start[episode - 1][..., None]
+                clip[key] = torch.from_numpy(np.take(self._latent, row, axis=0))  # [B..., T, D]
             else:
                 clip[key] = torch.from_numpy(np.take(self.store.arrays[key], frame, axis=0))  # [B..., T, S]
         # A device is needed for pinning: TorchRL leaves tensordicts without one alone.
@@ -201,6 +211,19 @@ class ClipStorage(TensorStorage):
         state = Storage.__getstate__(self)
         state.pop("_len_value", None)
         return state
+
+
+def _check_latents(latent: torch.Tensor, store: EpisodeStore, episodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Latents [N, D] and, for every episode of the store, the row of its first one (meaningless for other episodes)."""
+    length = store.length[episodes - 1]
+    if latent.ndim != 2 or len(latent) != length.sum():
+        raise ValueError(
+            f"these episodes have {length.sum()} frames, got latents {list(latent.shape)}: encode the same split with "
+            "encode_episodes."
+        )
+    first = np.zeros(len(store.length), dtype=np.int64)
+    first[episodes - 1] = np.cumsum(length) - length
+    return latent.detach().float().cpu().numpy(), first
 
 
 def clip_length(num_frames: int, frame_skip: int) -> int:

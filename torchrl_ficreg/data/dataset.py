@@ -28,7 +28,7 @@ from torchrl_ficreg.data.clips import ClipSampler, ClipStorage
 from torchrl_ficreg.data.layout import META_FILE
 from torchrl_ficreg.data.shards import open_store
 from torchrl_ficreg.data.store import EpisodeStore
-from torchrl_ficreg.keys import ACTION, DONE, EPISODE, PIXELS, STATE, STEP
+from torchrl_ficreg.keys import ACTION, DONE, EPISODE, LATENT, PIXELS, STATE, STEP
 
 Split = Literal["train", "validation", "evaluation", "all"]
 SPLITS = ("train", "validation", "evaluation")
@@ -73,7 +73,11 @@ class OfflineTrajectories(BaseDatasetExperienceReplay):
         num_frames (int, optional): T, frames of a clip. Default: ``4``.
         frame_skip (int, optional): F, environment steps from one frame to the next. Default: ``5``.
         keys (sequence of str, optional): what a clip holds, among ``pixels``, ``action`` (with ``mask``), ``state``,
-            ``episode``, ``step``. Default: ``("pixels", "action")``.
+            ``episode``, ``step`` and ``latent``. Default: ``("pixels", "action")``, or with ``latent`` below
+            ``("latent", "action")``.
+        latent (Tensor, optional): latents of all rows of the split [N, D], the result of
+            :func:`~torchrl_ficreg.data.encode_episodes`. Clips of them train everything but the encoder in a fraction of
+            the time. Default: ``None``.
         statistics (ActionStatistics, optional): z-scores the actions. Default: measured on the training episodes,
             whatever ``split`` is.
         sampler (ClipSampler, optional): the order. Default: ``ClipSampler(**order)``.
@@ -122,7 +126,8 @@ class OfflineTrajectories(BaseDatasetExperienceReplay):
         split_seed: int = 0,
         num_frames: int = 4,
         frame_skip: int = 5,
-        keys: Sequence[str] = (PIXELS, ACTION),
+        keys: Sequence[str] | None = None,
+        latent: torch.Tensor | None = None,
         statistics: ActionStatistics | None = None,
         sampler: ClipSampler | None = None,
         collate_fn: Callable[[Any], Any] | None = None,
@@ -153,8 +158,9 @@ class OfflineTrajectories(BaseDatasetExperienceReplay):
             self._episode_ids,
             num_frames=num_frames,
             frame_skip=frame_skip,
-            keys=keys,
+            keys=(PIXELS if latent is None else LATENT, ACTION) if keys is None else keys,
             statistics=statistics,
+            latent=latent,
         )
         if batch_size is not None and batch_size % sampler.world_size:
             ranks = sampler.world_size

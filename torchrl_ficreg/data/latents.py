@@ -1,4 +1,4 @@
-"""Latents of recorded episodes: encoded once by a frozen encoder, then sampled as clips or as pairs of frame and goal."""
+"""Latents of recorded episodes: encoded once by a frozen encoder, and sampled as pairs of frame and goal."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ def encode_episodes(
         description (str, optional): text of the progress bar. Default: ``None``, no bar.
 
     Returns:
-        float32 [N, D], episode after episode in the order of ``dataset.episodes``.
+        float32 [N, D], episode after episode in the order of ``dataset.episodes``: the ``latent`` of another
+        :class:`OfflineTrajectories` of the same split.
 
     Raises:
         ValueError: ``batch_size`` is not positive, or ``encode`` returns another shape or a non-finite number.
@@ -103,60 +104,6 @@ def _actions_and_blocks(dataset: OfflineTrajectories) -> tuple[torch.Tensor, tor
     # The last row of an episode has no action, so no block contains it; its frame may follow one.
     blocks = (length.repeat_interleave(length) - 1 - step) // dataset.frame_skip
     return dataset.statistics.normalize(raw), blocks
-
-
-class LatentClips:
-    """Clips of latents instead of frames, drawn with replacement, to train a predictor in a fraction of the time.
-
-    Args:
-        dataset (OfflineTrajectories): the episodes; its statistics z-score the actions, its ``num_frames`` is T.
-        latent (Tensor): [N, D], the result of :func:`encode_episodes` for them.
-
-    Raises:
-        ValueError: the latents belong to other episodes.
-
-    Examples:
-        >>> import numpy as np
-        >>> episode = {
-        ...     "pixels": np.zeros((12, 3, 4, 4), np.uint8),
-        ...     "action": np.zeros((12, 1), np.float32),
-        ...     "state": np.zeros((12, 1)),
-        ... }
-        >>> dataset = OfflineTrajectories.from_episodes([episode] * 4, split="all", num_frames=3, frame_skip=5)
-        >>> clips = LatentClips(dataset, torch.zeros(48, 16))
-        >>> len(clips), clips.sample(8)["latent"].shape, clips.sample(8)["action"].shape
-        (8, torch.Size([8, 3, 16]), torch.Size([8, 3, 5]))
-    """
-
-    def __init__(self, dataset: OfflineTrajectories, latent: torch.Tensor) -> None:
-        _check_latents(dataset, latent)
-        self.frame_skip, self.num_frames, self.latent = dataset.frame_skip, dataset.num_frames, latent
-        self.action, blocks = _actions_and_blocks(dataset)  # [N, A], [N]
-        self.action = self.action.to(latent.device)
-        self._start = (blocks >= self.num_frames - 1).nonzero().squeeze(-1)  # [M]
-
-    def __len__(self) -> int:
-        return len(self._start)
-
-    def sample(self, batch_size: int, *, generator: torch.Generator | None = None) -> TensorDict:
-        """Draws clips.
-
-        Args:
-            batch_size (int): B.
-
-        Keyword Args:
-            generator (torch.Generator, optional): of the draws, on the CPU. Default: ``None``, the global one.
-
-        Returns:
-            [B, T]: ``latent`` [B, T, D] and z-scored ``action`` blocks [B, T, F * A]; the last block, which leads out
-            of the clip, is zero.
-        """
-        start = self._start[torch.randint(len(self), (batch_size,), generator=generator)]  # [B]
-        frames = start.unsqueeze(-1) + torch.arange(self.num_frames) * self.frame_skip  # [B, T]
-        steps = frames[:, :-1].unsqueeze(-1) + torch.arange(self.frame_skip)  # [B, T - 1, F]
-        action = self.action[steps.to(self.latent.device)].flatten(2)  # [B, T - 1, F * A]
-        action = torch.nn.functional.pad(action, (0, 0, 0, 1))
-        return TensorDict({LATENT: self.latent[frames.to(self.latent.device)], ACTION: action}, frames.shape)
 
 
 class GoalRows:

@@ -10,7 +10,7 @@ from torchrl_ficreg.trainers.hooks import (
     Throughput,
     Validation,
 )
-from torchrl_ficreg.trainers.loggers import TolerantLogger
+from torchrl_ficreg.trainers.loggers import PhaseLogger, TolerantLogger
 from torchrl_ficreg.trainers.offline import OfflineTrainer, WarmupCosine
 from torchrl_ficreg.trainers.refinement import Refinement
 from torchrl_ficreg.trainers.signals import exit_on_signal, Preempted, PREEMPTED, stop_on_signal
@@ -26,6 +26,7 @@ __all__ = [
     "OfflineStepper",
     "OfflineTrainer",
     "PREEMPTED",
+    "PhaseLogger",
     "Preempted",
     "Progress",
     "ReadError",

@@ -9,7 +9,7 @@ A checkpoint is one file, an archive of ``torchrl.checkpoint``: JSON and raw ten
 ``trainer_state``, ``trainer_module.*``          step, learning-rate schedule, elapsed time, state of hooks
 ``collector``                                    position in the dataset, and its fingerprint
 ``rng``                                          random states of Python, NumPy and torch
-``refinement``                                   steps done after training
+``refinement``                                   whether the training on latents that follows is done
 ===============================================  ====================================================================
 
 :func:`checkpoint_components` names the first three, which :func:`load_world_model` reads;

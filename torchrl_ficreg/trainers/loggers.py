@@ -285,6 +285,30 @@ class TolerantLogger:
         return f"{type(self).__name__}({self._logger!r})"
 
 
+class PhaseLogger:
+    """Forwards the scalars of a later phase of a run: their names get a prefix, their steps follow those before.
+
+    Args:
+        logger (Logger): any logger.
+        prefix (str): put in front of every name.
+        first_step (int): added to every step; the largest one of the phase before.
+
+    Examples:
+        >>> class Print:
+        ...     def log_scalar(self, name, value, step=None):
+        ...         print(name, value, step)
+        >>> PhaseLogger(Print(), "refine/", 100).log_scalar("loss", 0.5, step=10)
+        refine/loss 0.5 110
+    """
+
+    def __init__(self, logger: Logger | TolerantLogger, prefix: str, first_step: int) -> None:
+        self._logger, self._prefix, self._first_step = logger, prefix, first_step
+
+    def log_scalar(self, name: str, value: float, step: int | None = None) -> None:
+        """See :meth:`torchrl.record.loggers.Logger.log_scalar`."""
+        self._logger.log_scalar(self._prefix + name, value, step=None if step is None else self._first_step + step)
+
+
 def _copy(value: Any) -> Any:
     """Copies a tensor or an array, which its owner may overwrite before the call is made."""
     if isinstance(value, torch.Tensor):

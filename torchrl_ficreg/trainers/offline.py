@@ -95,6 +95,7 @@ class OfflineTrainer(BaseTrainer):
         log_interval (int, optional): steps between rows of ``metrics.csv``. Default: ``10``.
         logger (Logger, optional): TorchRL logger that receives the same numbers. Default: ``None``.
         progress_bar (bool, optional): show a progress bar. Default: ``True``.
+        description (str, optional): text before the progress bar. Default: ``"train"``.
 
     Raises:
         ValueError: an argument is out of range, the buffer stores single steps, serves incomplete batches or those of
@@ -142,6 +143,7 @@ class OfflineTrainer(BaseTrainer):
         log_interval: int = 10,
         logger: Logger | None = None,
         progress_bar: bool = True,
+        description: str = "train",
     ) -> None:
         if epochs < 1 or lr <= 0 or weight_decay < 0 or clip_norm <= 0 or not 0 <= warmup < 1 or log_interval < 1:
             raise ValueError(
@@ -217,7 +219,7 @@ class OfflineTrainer(BaseTrainer):
             hook = Validation(validation_buffer, self.steps_per_epoch, validation_batches, precision, self.metrics_table)
             hook.register(self)
         if progress_bar and is_main():
-            Progress(self.total_steps, log_interval).register(self)
+            Progress(self.total_steps, log_interval, description).register(self)
 
     def train(self) -> None:
         """Trains to the last step; returns at once where a resumed run had reached it.

@@ -49,6 +49,14 @@ def test_a_file_is_converted_and_continued(tmp_path, execute, make_rows):
     assert (meta["env"], meta["env_kwargs"]["collision"]) == ("two_room", "endpoint")
 
 
+def test_converted_pictures_count_as_published(tmp_path, execute, make_rows):
+    """Whatever our own recordings of the environment show by default."""
+    rows = make_rows([30] * 6)
+    write_lewm(tmp_path / "arm.h5", {**rows, "qpos": rows["state"], "qvel": 0 * rows["state"]})
+    execute("source=arm.h5", "target=out", "env=reacher", "check_alignment=false")
+    assert EpisodeStore.open(tmp_path / "out").header.meta["env_kwargs"]["detail"] == "published"
+
+
 def test_other_data_name_their_columns(tmp_path, execute, make_rows):
     write_ogbench(tmp_path / "play.npz", make_rows([30] * 6, dims=4))
     execute("source=play.npz", "target=out", "env_name=mine", "state=[qpos]", "action_low=[-2,-2]", "action_high=[2,2]")

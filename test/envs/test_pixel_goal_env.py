@@ -191,6 +191,7 @@ def push_t_with(index, value):
         ("two_room", {"state": [112.0, 150.0]}, "inside the wall"),
         ("two_room", {"goal_state": [3.0, 150.0]}, "is not legal"),
         ("two_room", {"target": [60.0, 60.0]}, r"unknown reset options \['target'\]"),
+        ("two_room", {"draw_every": 0}, "'draw_every' must be a positive integer, got 0"),
         ("push_t", {"goal_state": push_t_with(4, -0.1)}, r"the angle, state\[4\], leaves \[0, 2 pi\): take it modulo 2 pi"),
         ("push_t", {"goal_state": push_t_with(4, 6.3)}, r"the angle, state\[4\], leaves"),
         ("push_t", {"state": push_t_with(0, -10_001.0)}, r"a coordinate or a velocity leaves \[-10000, 10000\]"),
@@ -274,10 +275,24 @@ def test_drawn_tasks_lead_through_the_door_at_least_25_steps_away():
 
 
 @pytest.mark.parametrize("integer", [int, np.int64])
-def test_sizes_and_seeds_may_be_integers_of_numpy(integer):
+def test_sizes_seeds_and_steps_may_be_integers_of_numpy(integer):
     env = TwoRoomEnv(image_size=integer(16))
     assert type(env.image_size) is int and env.reset(seed=0)[0]["pixels"].shape == (3, 16, 16)
-    assert_same(env.reset(seed=integer(3))[0], env.reset(seed=3)[0])
+    options = {"draw_every": integer(2)}
+    assert_same(env.reset(seed=integer(3), options=options)[0], env.reset(seed=3)[0])
+
+
+def test_pictures_are_drawn_every_few_steps_on_demand_and_repeated_between():
+    """All else is as without the option, which ends with the episode."""
+    whole, sparse = TwoRoomEnv(image_size=16, terminate_on_success=False), TwoRoomEnv(image_size=16)
+    every = [whole.reset(options=BOTH)[0], *(whole.step(np.ones(2))[0] for _ in range(7))]
+    observation = sparse.reset(options={**BOTH, "draw_every": 3})[0]
+    for step, expected in enumerate(every):
+        assert_same(observation, {**expected, "pixels": every[step - step % 3]["pixels"]})
+        observation["pixels"][:] = 0  # changes no later picture
+        observation = sparse.step(np.ones(2))[0]
+    sparse.reset(options=BOTH)
+    assert_same(sparse.step(np.ones(2))[0], every[1])
 
 
 LEFT_OPEN = """

@@ -15,6 +15,7 @@ from gymnasium import spaces
 
 from torchrl_ficreg.keys import GOAL_PIXELS, GOAL_STATE, PIXELS, STATE, SUCCESS
 
+DRAW_EVERY = "draw_every"  # reset option
 _LARGEST_ACTION = 100.0  # a hundred times the bounds of all environments; larger ones would make states illegal
 
 
@@ -26,7 +27,8 @@ class PixelGoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
     terminates at success if ``terminate_on_success``, and is never truncated here: time limits are set by a wrapper.
 
     ``reset(options={"state": s, "goal_state": g})`` starts from exactly these states; one that is left out is drawn
-    from the task's distribution.
+    from the task's distribution. With the further option ``"draw_every": k`` the picture of every k-th step of the episode
+    is drawn, and the observations between repeat it: for a policy that reads no others.
 
     A subclass sets ``action_space`` and ``state_space`` before it calls this constructor, and implements seven
     methods: :meth:`_sample_state`, :meth:`_sample_goal`, :meth:`_get_state`, :meth:`_set_state`,
@@ -69,6 +71,9 @@ class PixelGoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         )
         self._goal_state: np.ndarray | None = None
         self._goal_pixels: np.ndarray | None = None
+        self._draw_every = 1
+        self._steps = 0  # since the reset
+        self._last_pixels: np.ndarray | None = None  # which the next observations repeat
 
     # ------------------------------------------------------------------ the seven methods of a subclass
 
@@ -120,24 +125,30 @@ class PixelGoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
         Args:
             seed (int, optional): seeds the draws of this and of the following resets. Default: ``None``.
             options (dict, optional): ``"state"`` and ``"goal_state"``, [S] each, to start from and to reach; restored
-                bit for bit when float64. Default: ``None``.
+                bit for bit when float64. ``"draw_every"``, int, see the class; 1 if left out. Default: ``None``.
 
         Returns:
             observation and info, see the class.
 
         Raises:
-            ValueError: unknown options, or a state of the wrong shape, not finite or not legal.
+            ValueError: unknown options, a state of the wrong shape, not finite or not legal, or ``"draw_every"`` below 1.
         """
         options = {} if options is None else options
-        unknown = set(options) - {STATE, GOAL_STATE}
+        unknown = set(options) - {STATE, GOAL_STATE, DRAW_EVERY}
         if unknown:
-            raise ValueError(f"unknown reset options {sorted(unknown)}: use {STATE!r} and {GOAL_STATE!r}.")
+            raise ValueError(
+                f"unknown reset options {sorted(unknown)}: use {STATE!r} and {GOAL_STATE!r}, and {DRAW_EVERY!r}."
+            )
         # Checked before anything changes, so that a refused reset leaves the running episode intact.
-        given = {key: self.check_state(key, options[key]) for key in options}
+        given = {key: self.check_state(key, options[key]) for key in options if key != DRAW_EVERY}
+        draw_every = options.get(DRAW_EVERY, 1)
+        if not isinstance(draw_every, (int, np.integer)) or isinstance(draw_every, bool) or draw_every < 1:
+            raise ValueError(f"option {DRAW_EVERY!r} must be a positive integer, got {draw_every!r}.")
         super().reset(seed=int(seed) if isinstance(seed, np.integer) else seed)
         state = given[STATE] if STATE in given else self._sample_state(self.np_random)
         goal = given[GOAL_STATE] if GOAL_STATE in given else self._sample_goal(self.np_random, state)
         self._set_state(state)
+        self._draw_every, self._steps = draw_every, 0
         self._goal_state = goal
         self._goal_pixels = self._draw(goal)  # drawn once per episode
         return self._observe(), self._info(self._is_success(self._get_state(), goal))
@@ -170,6 +181,7 @@ class PixelGoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
                 f"{self.action_space.low.tolist()} to {self.action_space.high.tolist()}, in environment units."
             )
         self._step_physics(action)
+        self._steps += 1
         success = self._is_success(self._get_state(), self._goal_state)
         terminated = success and self.terminate_on_success
         return self._observe(), float(success), terminated, False, self._info(success)
@@ -210,9 +222,15 @@ class PixelGoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray], abc.ABC):
     # ------------------------------------------------------------------ internals
 
     def _observe(self) -> dict[str, np.ndarray]:
-        # Copies of the goal: a caller may write into an observation without changing the next one.
+        # Copies: a caller may write into an observation without changing the next one.
+        if self._draw_every == 1:
+            pixels = self._draw_current()
+        else:
+            if self._steps % self._draw_every == 0:
+                self._last_pixels = self._draw_current()
+            pixels = self._last_pixels.copy()
         return {
-            PIXELS: self._draw_current(),
+            PIXELS: pixels,
             GOAL_PIXELS: self._goal_pixels.copy(),
             STATE: self._get_state(),
             GOAL_STATE: self._goal_state.copy(),

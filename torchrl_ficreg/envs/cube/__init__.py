@@ -3,7 +3,8 @@
 * ``env.py``: :class:`CubeEnv`
 * ``tasks.py``: starts, goals and the success rules
 * ``physics.py``: OGBench's arm in MuJoCo
-* ``render.py``: pictures
+* ``render.py``: pictures by MuJoCo, of ``meshes.py``'s simpler meshes
+* ``raster.py``: fast pictures, without GL
 * ``expert.py``: the policy that records data
 """
 

@@ -30,7 +30,7 @@ class CubeEnv(PixelGoalEnv):
     Args:
         success_on (str, optional): ``"position"``, the published rule, or ``"pose"``; see
             :func:`torchrl_ficreg.envs.cube.tasks.is_success`. Default: ``"position"``.
-        detail (str, optional): of the pictures, ``"pixel"`` (fast) or ``"published"``; see
+        detail (str, optional): of the pictures, ``"fast"``, ``"pixel"`` or ``"published"``; see
             :func:`torchrl_ficreg.envs.cube.render.render_pixels`. Default: ``"pixel"``.
         **kwargs: see :class:`torchrl_ficreg.envs.base.PixelGoalEnv`.
 

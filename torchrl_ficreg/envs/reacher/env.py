@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args, Literal
 
 import numpy as np
 from gymnasium import spaces
@@ -10,6 +10,9 @@ from gymnasium import spaces
 from torchrl_ficreg.envs._gl import import_mujoco, MujocoHolder, OffscreenRenderer
 from torchrl_ficreg.envs.base import PixelGoalEnv
 from torchrl_ficreg.envs.reacher import physics, tasks
+from torchrl_ficreg.envs.reacher.render import render_pixels
+
+Detail = Literal["fast", "published"]
 
 _LARGEST = 1e4  # of all angles and velocities, far beyond what the motors can do
 
@@ -33,8 +36,12 @@ class ReacherEnv(MujocoHolder, PixelGoalEnv):
             ``True``.
         stop_within_action (bool, optional): end the action that first reaches the goal as soon as it does. False, for
             recordings, tests success after whole actions only. Default: ``True``.
-        shadow_size (int, optional): resolution of the shadow map. 512 instead of dm_control's 2048 makes software
-            rendering about twice as fast and changes about 1 in 1000 values of a picture. Default: ``2048``.
+        detail (str, optional): of the pictures. ``"published"`` is dm_control's scene, drawn by MuJoCo.
+            :func:`~torchrl_ficreg.envs.reacher.render.render_pixels` draws ``"fast"`` pictures, without GL and twenty times
+            as fast. Start, goal and all frames of a dataset have to be of one kind. Default: ``"published"``.
+        shadow_size (int, optional): resolution of the shadow map of published pictures; fast ones have no map. 512
+            instead of dm_control's 2048 makes software rendering about twice as fast and changes about 1 in 1000 values
+            of a picture. Default: ``2048``.
         **kwargs: of :class:`~torchrl_ficreg.envs.base.PixelGoalEnv`.
 
     Raises:
@@ -50,27 +57,39 @@ class ReacherEnv(MujocoHolder, PixelGoalEnv):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 25}
 
     def __init__(
-        self, *, wrap: bool = True, stop_within_action: bool = True, shadow_size: int = 2048, **kwargs: Any
+        self,
+        *,
+        wrap: bool = True,
+        stop_within_action: bool = True,
+        detail: Detail = "published",
+        shadow_size: int = 2048,
+        **kwargs: Any,
     ) -> None:
+        if detail not in get_args(Detail):
+            raise ValueError(f"detail must be one of {get_args(Detail)}, got {detail!r}.")
         if not isinstance(shadow_size, int) or isinstance(shadow_size, bool) or shadow_size < 1:
             raise ValueError(f"shadow_size must be a positive integer, got {shadow_size!r}.")
         self.wrap = wrap
         self.stop_within_action = stop_within_action
+        self.detail = detail
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         highest = np.array([np.inf, physics.WRIST_LIMIT + physics.WRIST_SLACK, np.inf, np.inf])
         self.state_space = spaces.Box(-highest, highest, dtype=np.float64)
         super().__init__(**kwargs)
         self._mujoco = import_mujoco()
         self._model = physics.load_model()
-        self._model.vis.quality.shadowsize = shadow_size
         self._data = self._mujoco.MjData(self._model)
-        self._drawn = self._mujoco.MjData(self._model)  # for pictures, so that drawing does not change the simulation
-        self._renderer = OffscreenRenderer(self._model, self.image_size)
+        self._renderer: OffscreenRenderer | None = None
+        if detail == "published":
+            self._model.vis.quality.shadowsize = shadow_size
+            self._drawn = self._mujoco.MjData(self._model)  # so that drawing does not change the simulation
+            self._renderer = OffscreenRenderer(self._model, self.image_size)
         self._reached = False  # in this episode; the start does not count
 
     def close(self) -> None:
-        """Releases the renderer's GL context; drawing again opens a new one."""
-        self._renderer.close()
+        """Releases the GL context of published pictures; drawing again opens a new one."""
+        if self._renderer is not None:
+            self._renderer.close()
 
     def _sample_state(self, rng: np.random.Generator) -> np.ndarray:
         return tasks.sample_state(rng)
@@ -96,6 +115,8 @@ class ReacherEnv(MujocoHolder, PixelGoalEnv):
                 return
 
     def _draw(self, state: np.ndarray) -> np.ndarray:
+        if self._renderer is None:
+            return render_pixels(state, size=self.image_size)
         self._drawn.qpos[:] = state[:2]
         self._mujoco.mj_forward(self._model, self._drawn)
         return self._renderer.draw(self._drawn, physics.CAMERA)

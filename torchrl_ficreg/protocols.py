@@ -50,17 +50,17 @@ class WorldModel(Protocol):
 
 
 class Cost(Protocol):
-    """Costs of candidates, lower is better; ``action`` and ``start`` may be left out of the signature."""
+    """Costs of candidates, lower is better; ``action``, ``start`` and ``time_to_go`` may be left out of the signature."""
 
-    def __call__(self, predicted: Tensor, goal: Tensor, *, action: Tensor, start: Tensor) -> Tensor:
-        """Predicted [E, K, T, D], goal [E, D], action [E, K, T, F * A] and start [E, D] -> [E, K]."""
+    def __call__(self, predicted: Tensor, goal: Tensor, *, action: Tensor, start: Tensor, time_to_go: Tensor) -> Tensor:
+        """Predicted [E, K, T, D], goal [E, D], action [E, K, T, F * A], start [E, D], time_to_go [E] -> [E, K]."""
 
 
 class Planner(Protocol):
-    """What MPCPolicy asks; of the keywords ``past_action`` [E, C - 1, F * A], ``initial`` [E, horizon, F * A], both optional."""
+    """What MPCPolicy asks. Keywords: ``past_action`` [E, C - 1, F * A], ``initial`` [E, horizon, F * A], ``time_to_go`` [E]."""
 
     world_model: WorldModel
-    config: Any  # with ``horizon``, ``receding_horizon`` and ``warm_start``, as a PlanConfig
+    config: Any  # with ``horizon``, ``receding_horizon``, ``warm_start`` as a PlanConfig; ``time_to_go`` is given if it has one
     context: int  # most frames C of a context
     action_bounds: tuple[Tensor, Tensor] | None  # (low [A], high [A]) in environment units
 

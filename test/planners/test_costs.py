@@ -10,7 +10,15 @@ from making import make_planner
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from torchrl_ficreg import ActionEffort, CostSum, GoalDistance, InverseConsistency, InverseDynamicsModel, PathDistance
+from torchrl_ficreg import (
+    ActionEffort,
+    CostSum,
+    GoalDistance,
+    InverseConsistency,
+    InverseDynamicsModel,
+    PathDistance,
+    StayDistance,
+)
 
 FAST = {"num_candidates": 32, "num_elites": 6, "iterations": 5}
 
@@ -21,57 +29,62 @@ def imagined():
     return torch.randn(2, 5, 3, 4), torch.randn(2, 4), torch.randn(2, 5, 3, 6), torch.randn(2, 4)
 
 
-def each(formula):
-    """A formula of environment and candidate, over all of them: [2, 5]."""
-    return torch.stack([torch.stack([formula(e, k) for k in range(5)]) for e in range(2)])
+@pytest.mark.parametrize(
+    ("cost", "formula"),
+    [
+        (GoalDistance(), lambda distance, action: distance[2]),
+        (PathDistance(), lambda distance, action: sum(distance) / 3),
+        (PathDistance(0.5), lambda distance, action: (distance[0] + 2 * distance[1] + 4 * distance[2]) / 7),
+        (ActionEffort(), lambda distance, action: sum(value**2 for value in action.flatten()) / 18),
+    ],
+    ids=["goal", "path", "discounted path", "effort"],
+)
+def test_a_cost_is_its_formula(imagined, cost, formula):
+    """Of the squared distances after each of three blocks, or of the actions, for every environment and candidate."""
+    predicted, goal, action, _ = imagined
+    distance = [[[((z - goal[e]) ** 2).sum() for z in predicted[e, k]] for k in range(5)] for e in range(2)]
+    expected = [[formula(distance[e][k], action[e, k]).item() for k in range(5)] for e in range(2)]
+    torch.testing.assert_close(CostSum([cost], [1.0])(*imagined), torch.tensor(expected))
 
 
-# Formulas
-
-
-def test_goal_distance_is_that_of_the_last_latent(imagined):
-    predicted, goal, *_ = imagined
-    expected = each(lambda e, k: sum((predicted[e, k, 2, d] - goal[e, d]) ** 2 for d in range(4)))
-    torch.testing.assert_close(GoalDistance()(predicted, goal), expected)
-
-
-@pytest.mark.parametrize(("discount", "weights"), [(1.0, (1 / 3, 1 / 3, 1 / 3)), (0.5, (1 / 7, 2 / 7, 4 / 7))])
-def test_path_distance_is_a_weighted_mean_over_the_blocks(imagined, discount, weights):
-    predicted, goal, *_ = imagined
-    distance = each(lambda e, k: sum(w * (predicted[e, k, t] - goal[e]).square().sum() for t, w in enumerate(weights)))
-    torch.testing.assert_close(PathDistance(discount)(predicted, goal), distance)
+def test_a_time_to_go_says_from_which_block_on_distances_count(imagined):
+    """Due at the horizon, staying is arriving; due at once, it is the whole path. A sum passes the time on."""
+    predicted, goal, *rest = imagined
+    goal_distance, stay, path = GoalDistance(), StayDistance(), PathDistance()
+    last, first = torch.tensor([3, 3]), torch.tensor([1, 1])
+    for cost in (goal_distance, stay):
+        torch.testing.assert_close(cost(predicted, goal), goal_distance(predicted, goal, last))
+        assert torch.equal(cost(predicted, goal), cost(predicted, goal, last))
+        mixed = cost(predicted, goal, torch.tensor([2, 1]))
+        assert mixed[0].equal(cost(predicted, goal, first + 1)[0]) and mixed[1].equal(cost(predicted, goal, first)[1])
+        assert torch.equal(CostSum([cost], [1.0])(predicted, goal, *rest, time_to_go=first), cost(predicted, goal, first))
+    torch.testing.assert_close(goal_distance(predicted, goal, first), goal_distance(predicted[:, :, :1], goal))
+    torch.testing.assert_close(stay(predicted, goal, first), path(predicted, goal))
 
 
 @pytest.mark.parametrize("discount", [0.0, 1.5, float("nan")])
-def test_a_discount_out_of_range_is_refused(discount):
+@pytest.mark.parametrize("cost", [PathDistance, StayDistance])
+def test_a_discount_out_of_range_is_refused(cost, discount):
     with pytest.raises(ValueError, match=r"discount must lie in \(0, 1\]"):
-        PathDistance(discount)
+        cost(discount)
 
 
-def test_effort_is_the_mean_squared_z_score(imagined):
-    predicted, goal, action, _ = imagined
-    expected = each(lambda e, k: sum(value**2 for value in action[e, k].flatten()) / 18)
-    torch.testing.assert_close(ActionEffort()(predicted, goal, action), expected)
-
-
-def test_consistency_is_the_error_of_the_recovered_actions(imagined):
-    """Step by step, from the latents before and after an imagined block."""
-    predicted, goal, action, start = imagined
-    inverse_model = InverseDynamicsModel(latent_dim=4, action_dim=6, hidden_dim=8).eval()
-
-    def error(e, k):
-        before, total = start[e], 0.0
-        for t in range(3):
-            recovered = inverse_model(latent=before, next_latent=predicted[e, k, t])
-            total = total + (recovered - action[e, k, t]).square().sum() / 18
-            before = predicted[e, k, t]
-        return total
-
-    with torch.no_grad():
-        torch.testing.assert_close(InverseConsistency(inverse_model)(predicted, goal, action, start), each(error))
-
-
-# Consistency
+@pytest.mark.parametrize(("kind", "history"), [("mlp", 1), ("transformer", 3)])
+@pytest.mark.parametrize("blocks", [1, 3, 5])
+def test_consistency_is_the_error_of_the_actions_recovered_from_the_last_latents(kind, history, blocks):
+    """Step by step, whatever the horizon: the error of step t is that of the window of latents that ends at t."""
+    sizes = {"history": history, "heads": 2, "depth": 1} if history > 1 else {}
+    inverse_model = InverseDynamicsModel(4, 6, 16, kind=kind, **sizes).eval()
+    predicted, goal = torch.randn(2, 5, blocks, 4), torch.randn(2, 4)
+    action, start = torch.randn(2, 5, blocks, 6), torch.randn(2, 4)
+    before = torch.cat([start[:, None, None].expand(-1, 5, 1, -1), predicted[:, :, :-1]], dim=2)
+    errors = []
+    for step in range(blocks):
+        window = slice(max(0, step - history + 1), step + 1)
+        recovered = inverse_model(latent=before[:, :, window], next_latent=predicted[:, :, window])[:, :, -1]
+        errors.append((recovered - action[:, :, step]).square())
+    expected = torch.stack(errors, dim=2).mean((-1, -2))
+    torch.testing.assert_close(InverseConsistency(inverse_model)(predicted, goal, action, start), expected)
 
 
 class Difference(nn.Module):
@@ -105,9 +118,6 @@ def test_with_it_a_planner_stays_in_the_training_distribution(linear_world, inve
         plan = make_planner("cem", linear_world(1), cost=cost, **settings).plan(latent, goal)["plan"]
         longest.append(plan.abs().max().item())
     assert longest[0] > 3 and longest[1] < 1.5
-
-
-# Sums
 
 
 def test_a_sum_weighs_its_terms(imagined):
@@ -178,9 +188,6 @@ def test_a_sum_without_terms_or_with_other_weights_is_refused(terms, weights):
         CostSum(terms, weights)
 
 
-# In a planner
-
-
 class NamesAction(nn.Module):
     def forward(self, predicted, goal, action):
         return (predicted[:, :, -1] - goal[:, None]).square().sum(-1) + 0 * action.sum((-1, -2))
@@ -196,7 +203,7 @@ def function(predicted, goal):
 
 
 def takes_all(predicted, goal, **extra):
-    assert set(extra) == {"action", "start"}
+    assert set(extra) == {"action", "start", "time_to_go"}
     assert extra["action"].shape[:3] == predicted.shape[:3] and extra["start"].shape == goal.shape
     return function(predicted, goal)
 
@@ -243,30 +250,3 @@ def test_start_is_the_present_and_action_the_candidates(tiny_world):
     assert last["start"].equal(context[:, -1])
     assert last["action"].equal(plan[:, None])  # the last call is for the cost of the plan
     assert last["predicted"].shape == (1, 1, 3, 6)
-
-
-def test_a_scale_free_sum_plans_the_same_in_other_units(linear_world):
-    """With MPPI, whose weights depend on the costs."""
-    goal, plans = torch.tensor([[3.0, 1.0], [-2.0, 0.5]]), []
-    for effort in (ActionEffort(), Scaled(ActionEffort(), 1000.0, 3.0)):
-        cost = CostSum([GoalDistance(), effort], [1.0, 0.3], scale_free=True)
-        planner = make_planner("mppi", linear_world(), cost=cost, **{**FAST, "num_elites": 16}, bounds="none")
-        plans.append(planner.plan(torch.zeros(2, 2), goal)["plan"])
-    torch.testing.assert_close(plans[1], plans[0], rtol=1e-2, atol=1e-2)
-
-
-@pytest.mark.parametrize("blocks", [1, 3, 5, 8])
-def test_an_inverse_model_with_a_history_gets_the_last_latents_of_every_step(blocks):
-    """Whatever the horizon: the error of step t is that of the window that ends at t."""
-    torch.manual_seed(0)
-    inverse_model = InverseDynamicsModel(4, 6, 16, kind="transformer", history=3, heads=2, depth=1).eval()
-    predicted, goal = torch.randn(2, 5, blocks, 4), torch.randn(2, 4)
-    action, start = torch.randn(2, 5, blocks, 6), torch.randn(2, 4)
-    before = torch.cat([start[:, None, None].expand(-1, 5, 1, -1), predicted[:, :, :-1]], dim=2)
-    errors = []
-    for step in range(blocks):
-        window = slice(max(0, step - 2), step + 1)
-        recovered = inverse_model(latent=before[:, :, window], next_latent=predicted[:, :, window])[:, :, -1]
-        errors.append((recovered - action[:, :, step]).square())
-    expected = torch.stack(errors, dim=2).mean((-1, -2))
-    torch.testing.assert_close(InverseConsistency(inverse_model)(predicted, goal, action, start), expected)

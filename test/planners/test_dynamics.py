@@ -69,9 +69,6 @@ def test_weights_trained_further_are_planned_with(tiny_world):
     assert not planner.plan(latent, goal)["plan_cost"].equal(before)
 
 
-# A user's own predictor
-
-
 class Own(nn.Module):
     """A network with nothing but the tensors that it maps: no linear layer, and nothing that could be bfloat16."""
 
@@ -166,7 +163,8 @@ def test_a_world_model_of_ones_own_needs_no_predictor(search, precision):
 
 def test_a_goal_policy_acts_in_a_world_model_of_ones_own():
     world, policy, goal = OwnWorld().eval(), GoalPolicy(2, 4).eval(), torch.randn(3, 2)
-    plan = GoalPolicyPlanner(world, PlanConfig(horizon=3, receding_horizon=1, bounds="none"), policy=policy).plan(goal, 0 * goal)
+    config = PlanConfig(horizon=3, receding_horizon=1, bounds="none")
+    plan = GoalPolicyPlanner(world, config, policy=policy).plan(goal, 0 * goal)
     with torch.no_grad():
         latents = torch.cat([goal.unsqueeze(1), world.rollout(goal.unsqueeze(1), plan["plan"])], dim=1)
         expected = policy.module(latents[:, :-1], 0 * latents[:, :-1])

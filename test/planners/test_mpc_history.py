@@ -52,9 +52,6 @@ def serve(policy, steps, envs=1, resets=None, seeds=None):
     return torch.stack(seen), torch.stack(actions)
 
 
-# A context that is given
-
-
 @pytest.mark.parametrize("search", SEARCHING)
 def test_the_cost_of_a_plan_is_that_of_its_rollout_from_the_context(tiny_world, search):
     """Three real frames and the two blocks between them; without them the same search finds another plan."""
@@ -81,12 +78,7 @@ def test_of_a_longer_context_the_newest_frames_are_taken(tiny_world, history):
         assert problem.past_action.equal(past[env : env + 1, 5 - history :])
 
 
-# A context that is collected
-
-
-@pytest.mark.parametrize(
-    ("receding_horizon", "expected"), [(1, [1, 2, 3, 3, 3, 3]), (2, [1, 3, 3]), (3, [1, 3])]
-)
+@pytest.mark.parametrize(("receding_horizon", "expected"), [(1, [1, 2, 3, 3, 3, 3]), (2, [1, 3, 3]), (3, [1, 3])])
 def test_the_context_grows_frame_by_frame_and_then_slides(tiny_world, receding_horizon, expected):
     """Six blocks. Frames on which no plan was made count as well; those in the middle of a block do not.
 
@@ -108,9 +100,7 @@ def test_the_context_grows_frame_by_frame_and_then_slides(tiny_world, receding_h
         torch.testing.assert_close(problem.past_action, blocks[:, first:now])
 
 
-@pytest.mark.parametrize(
-    ("sizes", "settings"), [({}, {"history": "one_frame"}), ({"history": 1}, {"history": "context"})]
-)
+@pytest.mark.parametrize(("sizes", "settings"), [({}, {"history": "one_frame"}), ({"history": 1}, {"history": "context"})])
 def test_where_one_frame_is_used_none_is_collected(tiny_world, sizes, settings):
     planner = recorded(tiny_world(**sizes), **settings)
     serve(MPCPolicy(planner), 5 * STEPS)
@@ -118,13 +108,15 @@ def test_where_one_frame_is_used_none_is_collected(tiny_world, sizes, settings):
     assert all(problem.past_action.shape == (1, 0, 4) for problem, _ in planner.problems)
 
 
-def test_a_reset_clears_the_context_of_one_environment(tiny_world):
-    """The environment that was reset starts from one frame; the other keeps its context."""
+def test_a_reset_clears_the_context_and_the_plan_of_one_environment(tiny_world):
+    """The environment that was reset starts from one frame and mean actions; the other continues."""
     world = tiny_world()
     planner = recorded(world)
     seen, _ = serve(MPCPolicy(planner), 4 * STEPS, envs=2, resets={2 * STEPS: [1]})
     ages = [(1, 1), (2, 2), (3, 1), (3, 2)]
     assert sorted(planner.contexts) == sorted(age for pair in ages for age in pair)
+    starts = {problem.latent.shape[1]: problem.initial for problem, _ in planner.problems[4:6]}  # right after the reset
+    assert (starts[1] == 0).all() and (starts[3] != 0).any()
     with torch.no_grad():
         fresh = world.encode(seen[2 * STEPS, 1:])  # [1, D]
     after = [problem.latent for problem, _ in planner.problems[-2:] if problem.latent.shape[1] == 2]
@@ -166,9 +158,6 @@ def test_those_of_one_age_are_planned_for_together(tiny_world, monkeypatch):
     assert shapes == [(4, 1), (2, 1), (2, 2), (2, 2), (2, 3), (4, 3)]
 
 
-# Warm start
-
-
 @pytest.mark.parametrize("receding_horizon", [1, 2, 3])
 def test_a_search_starts_from_what_was_not_executed(tiny_world, receding_horizon):
     """The last plan moved up by the executed blocks, and mean actions after it."""
@@ -187,14 +176,6 @@ def test_without_a_warm_start_it_starts_from_mean_actions(tiny_world):
     serve(MPCPolicy(planner), 3 * STEPS)
     assert len(planner.problems) == 3
     assert all((problem.initial == 0).all() for problem, _ in planner.problems)
-
-
-def test_a_fresh_environment_starts_from_mean_actions(tiny_world):
-    """Nothing of the old episode's plan is left, while the other environment continues its own."""
-    planner = recorded(tiny_world())
-    serve(MPCPolicy(planner), 3 * STEPS, envs=2, resets={2 * STEPS: [0]})
-    starts = {problem.latent.shape[1]: problem.initial for problem, _ in planner.problems[-2:]}
-    assert (starts[1] == 0).all() and (starts[3] != 0).any()
 
 
 def test_a_search_searches_around_its_initial_plan(linear_world):

@@ -181,19 +181,6 @@ def test_actions_never_leave_the_bounds_of_the_environment(linear_world):
     torch.testing.assert_close(served.mean(0), torch.where(away > 0, high, low), rtol=0.05, atol=0.02)
 
 
-@pytest.mark.parametrize("num_envs", [1, 2])
-def test_it_drives_a_torchrl_environment(tiny_world, num_envs):
-    """One plan per block of two steps in a plain env.rollout, through whatever becomes of the tensordict in between."""
-    env = make_env("two_room", num_envs, image_size=16, seed=0)
-    policy = MPCPolicy(make_planner("cem", tiny_world()))
-    td = env.rollout(7, policy, break_when_any_done=False)
-    counts = td["mpc", "count"].reshape(num_envs, 7)
-    assert counts.tolist() == [[1, 1, 2, 2, 3, 3, 4]] * num_envs
-    assert td["action"].abs().max() <= 1.0
-    moved = td["next", "state"] - td["state"]
-    assert (moved != 0).any()
-
-
 def test_stepping_by_hand_is_the_same_as_a_rollout(tiny_world):
     policy = MPCPolicy(make_planner("cem", tiny_world()))
     expected = make_env("two_room", 2, image_size=16, seed=0).rollout(5, policy, break_when_any_done=False)["action"]

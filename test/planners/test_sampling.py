@@ -31,13 +31,6 @@ def search(name, world, goal, distance=None, **settings):
     return planner.plan(torch.zeros(1, 2), goal)["plan"][0], evaluated
 
 
-def same_for_all(predicted, goal):
-    return torch.ones(predicted.shape[:2])
-
-
-# iCEM
-
-
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
@@ -85,9 +78,6 @@ def test_momentum_keeps_part_of_the_old_mean(linear_world, goal):
         torch.testing.assert_close(after[0], 0.75 * elites + 0.25 * before[0])
 
 
-# Coloured noise
-
-
 @pytest.mark.parametrize("length", [2, 7, 20])
 @pytest.mark.parametrize("beta", [0.5, 1.0, 2.0, 4.0])
 def test_coloured_noise_has_unit_variance_at_every_time_and_the_stated_spectrum(beta, length):
@@ -119,9 +109,6 @@ def test_noise_runs_on_across_the_borders_of_blocks(linear_world):
     torch.testing.assert_close(raw.var(0), torch.ones(9, 2), rtol=0.06, atol=0)
 
 
-# MPPI
-
-
 @pytest.mark.parametrize("temperature", [1e-6, 0.7, 1e6])
 def test_its_weights_are_a_softmax_over_the_standardised_costs_of_the_elites(linear_world, goal, temperature):
     """Near zero the best candidate is taken, at a high temperature all elites count the same."""
@@ -135,7 +122,8 @@ def test_its_weights_are_a_softmax_over_the_standardised_costs_of_the_elites(lin
 @pytest.mark.parametrize("temperature", [0.5, 1e-12])
 def test_elites_that_cost_the_same_count_the_same(linear_world, temperature):
     """As on a corner of the bounds: no division of zero by zero."""
-    plan, evaluated = search("mppi", linear_world(), torch.zeros(1, 2), same_for_all, temperature=temperature)
+    world, goal = linear_world(), torch.zeros(1, 2)
+    plan, evaluated = search("mppi", world, goal, lambda z, goal: torch.ones(z.shape[:2]), temperature=temperature)
     candidates, cost = evaluated[-2]
     torch.testing.assert_close(plan, candidates[cost.topk(8, largest=False).indices].mean(0))
 

@@ -5,7 +5,14 @@ from __future__ import annotations
 from torchrl_ficreg.planners.base import LatentPlanner
 from torchrl_ficreg.planners.cem import CEMConfig, LatentCEMPlanner, SamplingPlanner
 from torchrl_ficreg.planners.config import PlanConfig
-from torchrl_ficreg.planners.costs import ActionEffort, CostSum, GoalDistance, InverseConsistency, PathDistance
+from torchrl_ficreg.planners.costs import (
+    ActionEffort,
+    CostSum,
+    GoalDistance,
+    InverseConsistency,
+    PathDistance,
+    StayDistance,
+)
 from torchrl_ficreg.planners.goal_policy import GoalPolicyPlanner
 from torchrl_ficreg.planners.gradient import GradientConfig, GradientPlanner
 from torchrl_ficreg.planners.latent_env import LatentGoalEnv
@@ -51,4 +58,5 @@ __all__ = [
     "SEARCHES",
     "SamplingPlanner",
     "ShootingConfig",
+    "StayDistance",
 ]

@@ -42,9 +42,10 @@ class Problem:
         past_action: z-scored blocks executed between the frames of the context [e, C - 1, F * A].
         goal: [e, D].
         initial: mean of the first iteration [e, horizon, F * A].
+        time_to_go: blocks until the goal is due [e] int64, from 1 to the horizon.
         bounds: of a z-scored block, (low [F * A], high [F * A]), equal where a component is constant, or None.
         generators: one for each environment.
-        imagined_cost: (latent, past_action, goal, candidates [e, K, horizon, F * A]) -> [e, K].
+        imagined_cost: (latent, past_action, goal, time_to_go, candidates [e, K, horizon, F * A]) -> [e, K].
         proposals: plans of the goal policy [e, 1, horizon, F * A], or None.
     """
 
@@ -52,6 +53,7 @@ class Problem:
     past_action: torch.Tensor
     goal: torch.Tensor
     initial: torch.Tensor
+    time_to_go: torch.Tensor
     bounds: tuple[torch.Tensor, torch.Tensor] | None
     generators: list[torch.Generator]
     imagined_cost: Callable[..., torch.Tensor]
@@ -59,7 +61,7 @@ class Problem:
 
     def cost(self, candidates: torch.Tensor) -> torch.Tensor:
         """Imagined cost [e, K] of z-scored action blocks [e, K, horizon, F * A]."""
-        return self.imagined_cost(self.latent, self.past_action, self.goal, candidates)
+        return self.imagined_cost(self.latent, self.past_action, self.goal, self.time_to_go, candidates)
 
     def clamp(self, action: torch.Tensor) -> torch.Tensor:
         """Blocks [..., F * A] inside the bounds."""
@@ -183,6 +185,7 @@ class LatentPlanner(KeyedMixin, TensorDictModuleBase, abc.ABC):
         *,
         past_action: torch.Tensor | None = None,
         initial: torch.Tensor | None = None,
+        time_to_go: torch.Tensor | None = None,
     ) -> TensorDict:
         """Searches a plan for every environment.
 
@@ -192,6 +195,7 @@ class LatentPlanner(KeyedMixin, TensorDictModuleBase, abc.ABC):
             seeds (Tensor, optional): [E] int64, identify the random draws. Default: 0, 1, ...
             past_action (Tensor, optional): z-scored blocks executed between the frames of the context [E, C - 1, F * A].
             initial (Tensor, optional): z-scored mean of the first iteration [E, horizon, F * A]. Default: zeros.
+            time_to_go (Tensor, optional): blocks until the goal is due [E] int64, given to the cost. Default: the horizon.
 
         Returns:
             a tensordict with ``plan`` [E, horizon, F * A], z-scored, in the dtype of ``latent``, and ``plan_cost`` [E]. With
@@ -201,7 +205,7 @@ class LatentPlanner(KeyedMixin, TensorDictModuleBase, abc.ABC):
         Raises:
             ValueError: other shapes, numbers that are not finite, or a world model in train mode.
         """
-        inputs = check_inputs(self.world_model, self.config.horizon, latent, goal, seeds, past_action, initial)
+        inputs = check_inputs(self.world_model, self.config.horizon, latent, goal, seeds, past_action, initial, time_to_go)
         first = max(0, inputs.latent.shape[1] - self.context)
         inputs = inputs._replace(latent=inputs.latent[:, first:], past_action=inputs.past_action[:, first:])
         inputs = inputs.to(torch.promote_types(latent.dtype, torch.float32))  # which the std of a population needs
@@ -214,11 +218,22 @@ class LatentPlanner(KeyedMixin, TensorDictModuleBase, abc.ABC):
             if self.needs_gradient:  # autograd cannot save tensors created in inference mode by the caller
                 inputs = inputs.clone()
             groups = inputs.split(self._group_size(inputs.latent))
-            result = torch.cat([self._search(self._problem(group, dynamics)) for group in groups])
+            result = torch.cat([self._solve(self._problem(group, dynamics)) for group in groups])
         result = result.clone()  # outside the inference mode, so that the user may write into it
         result[PLAN] = result[PLAN].to(latent.dtype)
         if not (result[PLAN].isfinite().all() and result[PLAN_COST].isfinite().all()):
             raise ValueError("the plan or its cost is not finite: did the predictor or the cost diverge?")
+        return result
+
+    def _solve(self, problem: Problem) -> TensorDict:
+        """The result of the search, with ``config.fallback`` replaced by the initial plan or zero actions where that costs less."""
+        result = self._search(problem)
+        if self.config.fallback:
+            statistics, initial = self.world_model.statistics, problem.initial
+            idle = statistics.normalize(torch.zeros_like(statistics.mean)).repeat(self.world_model.frame_skip)  # [F * A]
+            options = torch.stack([result[PLAN], initial, problem.clamp(idle.to(initial).expand_as(initial))], dim=1)
+            cost, best = problem.cost(options).min(1)  # [e]
+            result[PLAN], result[PLAN_COST] = options[torch.arange(len(best), device=best.device), best], cost
         return result
 
     @abc.abstractmethod
@@ -234,7 +249,7 @@ class LatentPlanner(KeyedMixin, TensorDictModuleBase, abc.ABC):
         return max(1, rollouts_within(self.world_model, self.config.memory_budget, steps))
 
     def _problem(self, inputs: PlanInputs, dynamics: LatentWorldModel) -> Problem:
-        latent, past_action, goal, initial, seeds = inputs
+        latent, past_action, goal, initial, time_to_go, seeds = inputs
         bounds, proposals = self.block_bounds(), None
         if self.policy is not None and self.config.num_proposals:
             horizon = self.config.horizon
@@ -242,7 +257,7 @@ class LatentPlanner(KeyedMixin, TensorDictModuleBase, abc.ABC):
         initial = initial if bounds is None else initial.clamp(*bounds)
         generators = [make_generator(self.config.seed, seed, latent.device) for seed in seeds]
         imagined_cost = functools.partial(self._rollout_cost(), dynamics)
-        return Problem(latent, past_action, goal, initial, bounds, generators, imagined_cost, proposals)
+        return Problem(latent, past_action, goal, initial, time_to_go, bounds, generators, imagined_cost, proposals)
 
     def _rollout_cost(self) -> Callable[..., torch.Tensor]:
         if not self.config.compile:
@@ -252,13 +267,14 @@ class LatentPlanner(KeyedMixin, TensorDictModuleBase, abc.ABC):
             self._compiled = torch.compile(self._imagined_cost, **mode)
         return self._compiled
 
-    def _imagined_cost(self, dynamics, latent, past_action, goal, action) -> torch.Tensor:
+    def _imagined_cost(self, dynamics, latent, past_action, goal, time_to_go, action) -> torch.Tensor:
         """Cost [e, K] of candidates [e, K, horizon, F * A]; the other shapes are those of a Problem."""
         context, past = (x.unsqueeze(1).expand(-1, action.shape[1], -1, -1) for x in (latent, past_action))  # [e, K, ...]
         blocks, dtype = torch.cat([past, action], dim=2), predictor_dtype(dynamics, goal.dtype)
         predicted = dynamics.rollout(context.to(dtype), blocks.to(dtype)).to(goal.dtype)  # [e, K, horizon, D]
         with autocast(latent.device, "fp32" if dynamics is self.world_model else "bf16"):
-            cost = call_cost(self.cost, self._cost_keywords, predicted, goal, action=action, start=latent[:, -1])
+            given = {"action": action, "start": latent[:, -1], "time_to_go": time_to_go}
+            cost = call_cost(self.cost, self._cost_keywords, predicted, goal, **given)
         return cost.to(goal.dtype)
 
 

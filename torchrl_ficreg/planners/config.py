@@ -15,8 +15,8 @@ _LARGEST_COUNT = 10**6  # a larger one is a typing error
 _POSITIVE = ("memory_budget", "std", "temperature", "learning_rate")
 _AT_LEAST = {
     **dict.fromkeys(("num_candidates", "num_elites"), 2),
-    **dict.fromkeys(("horizon", "receding_horizon", "iterations", "decay"), 1),
-    **dict.fromkeys(("num_proposals", "proposal_std", "stop_std", "min_std", "noise_beta", "seed"), 0),
+    **dict.fromkeys(("horizon", "receding_horizon", "min_time_to_go", "iterations", "decay"), 1),
+    **dict.fromkeys(("time_to_go", "num_proposals", "proposal_std", "stop_std", "min_std", "noise_beta", "seed"), 0),
 }
 
 
@@ -35,6 +35,9 @@ class PlanConfig:
     bounds: Literal["environment", "none"] = "environment"  # of the actions
     history: Literal["context", "one_frame"] = "context"  # real frames that a rollout starts from: all it can use, or one
     warm_start: bool = True  # start from the blocks of the last plan that were not executed
+    time_to_go: int = 0  # blocks from the start of an episode until its goal is due; 0: at the horizon of every plan
+    min_time_to_go: int = 1  # of every plan, also of those made once the goal is due
+    fallback: bool = False  # keep the rest of the last plan (needs warm_start), or act with zeros, where predicted to cost less
     num_proposals: int = 30  # candidates of the first iteration that a goal policy proposes, where there is one, at most
     proposal_std: float = 0.3  # of the noise on all proposals but the first, in z-scored actions
     precision: Precision = "auto"  # of the rollouts: "auto" (bf16 where that is fast, own networks as they are), "fp32" or "bf16"

@@ -1,8 +1,9 @@
 """Costs of imagined trajectories; lower is better.
 
-A cost is a module or a function ``cost(predicted, goal, *, action, start)`` -> [E, K] for E environments with K candidates of T
-action blocks: predicted latents [E, K, T, D], goal latents [E, D], the candidates' z-scored action blocks [E, K, T, F * A] and
-the latents they start from [E, D]. It may leave out the keyword arguments that it does not use.
+A cost is a module or a function ``cost(predicted, goal, *, action, start, time_to_go)`` -> [E, K] for E environments with K
+candidates of T action blocks: predicted latents [E, K, T, D], goal latents [E, D], the candidates' z-scored action blocks
+[E, K, T, F * A], the latents they start from [E, D] and the number of blocks until the goal is due [E] int64, from 1 to T. It may
+leave out the keyword arguments that it does not use.
 
 :class:`GoalDistance` and :class:`PathDistance` are in squared latent units, :class:`ActionEffort` and
 :class:`InverseConsistency` in squared z-scores; :class:`CostSum` adds them up, independent of their scales if asked.
@@ -25,7 +26,7 @@ Cost = Callable[..., torch.Tensor]
 
 
 class GoalDistance(nn.Module):
-    """Squared distance of the last predicted latent from the goal (arXiv 2603.19312).
+    """Squared distance from the goal when it is due: of the last predicted latent (arXiv 2603.19312) without a time-to-go.
 
     Examples:
         >>> import torch
@@ -33,9 +34,54 @@ class GoalDistance(nn.Module):
         tensor([[4., 4., 4.]])
     """
 
-    def forward(self, predicted: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
-        """[E, K, T, D] and [E, D] -> [E, K]."""
-        return (predicted[:, :, -1] - goal.unsqueeze(1)).square().sum(-1)
+    def forward(
+        self, predicted: torch.Tensor, goal: torch.Tensor, time_to_go: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """[E, K, T, D], [E, D] and [E] -> [E, K]."""
+        if time_to_go is None:
+            due = predicted[:, :, -1]
+        else:
+            due = predicted[torch.arange(len(predicted), device=predicted.device), :, time_to_go - 1]  # [E, K, D]
+        return (due - goal.unsqueeze(1)).square().sum(-1)
+
+
+class StayDistance(nn.Module):
+    """Squared distance from the goal, averaged over the blocks from the one at which the goal is due to the last.
+
+    A plan arrives in time and stays. Where the goal is due at the horizon, this is :class:`GoalDistance`; where it is due at
+    once, without a discount, :class:`PathDistance`.
+
+    Args:
+        discount (float, optional): weight of each block relative to the one before; below 1, distances soon after the arrival
+            have more weight. Default: ``1.0``.
+
+    Raises:
+        ValueError: ``discount`` is not in (0, 1].
+
+    Examples:
+        >>> import torch
+        >>> path = torch.tensor([[[[2.0], [0.0], [0.0]], [[2.0], [0.0], [2.0]]]])  # stays, passes by: [1, 2, 3, 1]
+        >>> due = torch.tensor([2])
+        >>> StayDistance()(path, torch.zeros(1, 1), due), StayDistance(discount=0.25)(path, torch.zeros(1, 1), due)
+        (tensor([[0., 2.]]), tensor([[0.0000, 0.8000]]))
+    """
+
+    def __init__(self, discount: float = 1.0) -> None:
+        super().__init__()
+        self.discount = _check_discount(discount)
+
+    def forward(
+        self, predicted: torch.Tensor, goal: torch.Tensor, time_to_go: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """[E, K, T, D], [E, D] and [E] -> [E, K]."""
+        blocks = predicted.shape[2]
+        if time_to_go is None:
+            time_to_go = torch.full((len(predicted),), blocks, device=predicted.device)
+        distance = (predicted - goal[:, None, None]).square().sum(-1)  # [E, K, T]
+        late = torch.arange(1, blocks + 1, device=predicted.device) - time_to_go.unsqueeze(1)  # [E, T]
+        weight = torch.where(late < 0, 0.0, self.discount ** late.clamp_min(0).to(distance.dtype))
+        weight = weight / weight.sum(1, keepdim=True)
+        return (distance * weight.unsqueeze(1)).sum(-1)
 
 
 class PathDistance(nn.Module):
@@ -57,9 +103,7 @@ class PathDistance(nn.Module):
 
     def __init__(self, discount: float = 1.0) -> None:
         super().__init__()
-        if not 0 < discount <= 1:
-            raise ValueError(f"discount must lie in (0, 1], got {discount}.")
-        self.discount = discount
+        self.discount = _check_discount(discount)
 
     def forward(self, predicted: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
         """[E, K, T, D] and [E, D] -> [E, K]."""
@@ -172,11 +216,16 @@ class CostSum(nn.Module):
         self._keywords = [keywords_of(term) for term in terms]
 
     def forward(
-        self, predicted: torch.Tensor, goal: torch.Tensor, action: torch.Tensor, start: torch.Tensor
+        self,
+        predicted: torch.Tensor,
+        goal: torch.Tensor,
+        action: torch.Tensor,
+        start: torch.Tensor,
+        time_to_go: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """[E, K, T, D], [E, D], [E, K, T, F * A] and [E, D] -> [E, K]."""
+        """[E, K, T, D], [E, D], [E, K, T, F * A], [E, D] and [E] -> [E, K]."""
         values = [
-            call_cost(term, keywords, predicted, goal, action=action, start=start)
+            call_cost(term, keywords, predicted, goal, action=action, start=start, time_to_go=time_to_go)
             for term, keywords in zip(self.terms, self._keywords)
         ]  # each [E, K]
         if self.scale_free:
@@ -185,8 +234,14 @@ class CostSum(nn.Module):
         return torch.stack([weight * value for weight, value in zip(self.weights, values)]).sum(0)
 
 
+def _check_discount(discount: float) -> float:
+    if not 0 < discount <= 1:
+        raise ValueError(f"discount must lie in (0, 1], got {discount}.")
+    return discount
+
+
 def keywords_of(cost: Cost) -> tuple[str, ...]:
-    """Which of ``action`` and ``start`` a cost takes.
+    """Which of ``action``, ``start`` and ``time_to_go`` a cost takes.
 
     Raises:
         TypeError: it cannot be called, or is a class in place of an instance of it.
@@ -201,7 +256,7 @@ def keywords_of(cost: Cost) -> tuple[str, ...]:
     except ValueError:  # a ScriptFunction, for example, has no signature
         return ()
     takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-    return tuple(name for name in ("action", "start") if takes_all or name in parameters)
+    return tuple(name for name in ("action", "start", "time_to_go") if takes_all or name in parameters)
 
 
 def call_cost(
@@ -209,16 +264,13 @@ def call_cost(
     keywords: Sequence[str],
     predicted: torch.Tensor,
     goal: torch.Tensor,
-    *,
-    action: torch.Tensor,
-    start: torch.Tensor,
+    **given: torch.Tensor | None,
 ) -> torch.Tensor:
-    """Calls a cost with those of ``action`` and ``start`` that are in ``keywords``; see the module for the shapes.
+    """Calls a cost with those of ``given`` that are in ``keywords``: ``action``, ``start``, ``time_to_go``; see the module.
 
     Raises:
         ValueError: the result has another shape than [E, K].
     """
-    given = {"action": action, "start": start}
     value = cost(predicted, goal, **{name: given[name] for name in keywords})
     shape = value.shape if isinstance(value, torch.Tensor) else type(value).__name__
     if shape != predicted.shape[:2]:

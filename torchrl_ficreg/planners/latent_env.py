@@ -32,7 +32,8 @@ class LatentGoalEnv(KeyedMixin, ModelBasedEnvBase):
     * ``"distance"``: :math:`-d(z_{t+1}, g)`. The sum is the negative distance over the whole path.
 
     Those planners execute the first block and plan again. Shorten ``planning_horizon`` with every step left, or choose
-    ``"distance"``: with a constant horizon, ``"progress"`` does not reward an early arrival.
+    ``"distance"``: with a constant horizon, ``"progress"`` does not reward an early arrival. :class:`~torchrl_ficreg.MPCPolicy`
+    counts down a time-to-go.
 
     Start with ``reset(tensordict)``, where the tensordict has ``latent`` and ``goal_latent`` [..., D]; it writes the other
     entries. All five are observations, because TorchRL passes only observations on to the next step:

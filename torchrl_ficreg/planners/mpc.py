@@ -46,6 +46,10 @@ class MPCPolicy(KeyedMixin, TensorDictModuleBase):
     old episode continue. ``plan_seed`` identifies the random draws of each environment, 0, 1, ... when absent: a plan depends on
     this number and on how many plans came before it in the episode, not on the other environments.
 
+    With ``time_to_go`` in the planner's configuration, the goal of an episode is due after so many blocks: each plan gets the
+    blocks that are left, between ``min_time_to_go`` and the horizon. Otherwise a goal is due at the horizon of every plan, and
+    a policy that plans again before need not arrive.
+
     Args:
         planner (LatentPlanner): makes the plans; its world model encodes the frames.
 
@@ -85,6 +89,12 @@ class MPCPolicy(KeyedMixin, TensorDictModuleBase):
     def _apply_keys(self) -> None:
         keys = self.tensor_keys
         self.in_keys, self.out_keys = [keys.pixels, keys.goal_pixels], [keys.action, keys.memory]
+
+    @property
+    def frame_interval(self) -> int:
+        """Environment steps between the frames that are read: a plan's, or a block's for a predictor with a history."""
+        blocks = 1 if self.planner.context > 1 else self.planner.config.receding_horizon
+        return blocks * self.planner.world_model.frame_skip
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes one raw action per environment, after planning where a plan is due; see the class."""
@@ -172,14 +182,16 @@ class MPCPolicy(KeyedMixin, TensorDictModuleBase):
         mixed = [mix_seeds(seed % 2**63, count) for seed, count in zip(seeds.tolist(), memory["count"].tolist())]
         draws = torch.tensor(mixed, device="cpu")
         initial = self._rest_of_last_plan(memory)  # [e, horizon, F * A]
+        time_to_go = self._time_to_go(memory["count"])  # [e], or None
         plan, cost = torch.zeros_like(initial), torch.zeros_like(memory[PLAN_COST])
         for past in memory["past_count"].unique().tolist():  # contexts of one length can be planned from together
             rows = memory["past_count"] == past
             first = memory[PAST_LATENT].shape[1] - past
             context = torch.cat([memory[PAST_LATENT][rows, first:], latent[rows].unsqueeze(1)], dim=1)  # [., C, D]
             past_action = memory[PAST_ACTION][rows, first:]
+            timed = {} if time_to_go is None else {"time_to_go": time_to_go[rows]}
             result = self.planner.plan(
-                context, goal[rows], draws[rows.cpu()], past_action=past_action, initial=initial[rows]
+                context, goal[rows], draws[rows.cpu()], past_action=past_action, initial=initial[rows], **timed
             )
             plan[rows], cost[rows] = result[PLAN].to(plan.dtype), result[PLAN_COST].to(cost.dtype)
         blocks = plan[:, : config.receding_horizon]  # [e, R, F * A]
@@ -188,6 +200,14 @@ class MPCPolicy(KeyedMixin, TensorDictModuleBase):
             queue = queue.clamp(*(bound.to(device) for bound in self.planner.action_bounds))
         count, queue = memory["count"] + 1, queue.to(memory["queue"].dtype)
         return memory.update({PLAN: plan, PLAN_COST: cost, "queue": queue, "cursor": torch.zeros_like(count), "count": count})
+
+    def _time_to_go(self, count: torch.Tensor) -> torch.Tensor | None:
+        """Blocks until the goal is due [e], after ``count`` [e] plans in the episode; None without ``config.time_to_go``."""
+        config = self.planner.config
+        if not getattr(config, "time_to_go", 0):
+            return None
+        left, least = config.time_to_go - count * config.receding_horizon, getattr(config, "min_time_to_go", 1)
+        return left.clamp(min(least, config.horizon), config.horizon)
 
     def _rest_of_last_plan(self, memory: TensorDict) -> torch.Tensor:
         """The blocks of the last plan that were not executed, then mean actions: [e, horizon, F * A]."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -61,17 +63,9 @@ def test_rank_correlation_is_spearmans(first, second, expected):
     assert rank_correlation(first, second) == pytest.approx(expected)
 
 
-class Positions:
+def positions(scale: float = 1.0) -> SimpleNamespace:
     """A world model whose latent is the state itself, which the first two pixels spell out."""
-
-    action_mean = torch.zeros(2)
-
-    def __init__(self, scale: float = 1.0) -> None:
-        self.scale = scale
-
-    def encode(self, pixels: torch.Tensor) -> torch.Tensor:
-        """[N, 3, H, W] -> [N, 2]."""
-        return self.scale * pixels[:, 0, 0, :2].float()
+    return SimpleNamespace(action_mean=torch.zeros(2), encode=lambda pixels: scale * pixels[:, 0, 0, :2].float())
 
 
 @pytest.fixture(scope="module")
@@ -90,20 +84,20 @@ def walks() -> OfflineTrajectories:
 
 @pytest.mark.parametrize(("scale", "expected"), [(0.1, 1), (0.0, 0)], ids=["the state", "collapsed"])
 def test_a_latent_that_is_the_state_follows_it_perfectly_and_a_collapsed_one_not_at_all(walks, scale, expected):
-    profile = latent_distance(Positions(scale), walks, num_frames=100)
+    profile = latent_distance(positions(scale), walks, num_frames=100)
     assert profile.rank_correlation == pytest.approx(expected, abs=1e-6)
     assert len(profile.true) == 100 * 99 / 2
     assert profile.latent == pytest.approx(scale * profile.true, rel=1e-5)
 
 
 def test_the_same_frames_are_compared_every_time_and_never_more_than_there_are(walks):
-    first, again = (latent_distance(Positions(), walks, num_frames=50, seed=1) for _ in range(2))
+    first, again = (latent_distance(positions(), walks, num_frames=50, seed=1) for _ in range(2))
     assert np.array_equal(first.true, again.true)
-    assert not np.array_equal(first.true, latent_distance(Positions(), walks, num_frames=50, seed=2).true)
-    assert len(latent_distance(Positions(), walks, num_frames=10_000).true) == 300 * 299 / 2
+    assert not np.array_equal(first.true, latent_distance(positions(), walks, num_frames=50, seed=2).true)
+    assert len(latent_distance(positions(), walks, num_frames=10_000).true) == 300 * 299 / 2
 
 
 def test_bins_hold_equally_many_pairs_and_ordered_quantiles(walks):
-    center, quantiles = latent_distance(Positions(), walks).bins(count=10)
+    center, quantiles = latent_distance(positions(), walks).bins(count=10)
     assert center.shape == (10,) and quantiles.shape == (10, 3)
     assert (np.diff(center) > 0).all() and (np.diff(quantiles, axis=1) >= 0).all()

@@ -50,33 +50,21 @@ def test_the_oracle_arrives_when_physics_says():
 
 
 @pytest.mark.parametrize("policy", ["random", "planner"])
-def test_an_outcome_does_not_depend_on_how_many_run_side_by_side(policy, planner):
-    """1, 3 or all at once, and the first three alone: the same frames, hence the same actions, to the last pixel."""
-    chosen, pairs = planner if policy == "planner" else UniformPolicy(*BOX), same_room_pairs()
-    runs = [evaluate(chosen, pairs, num_envs=number, record=len(pairs)) for number in (len(pairs), 1, 3)]
+def test_an_outcome_depends_on_the_pair_alone(policy, planner):
+    """Whatever the global random state, 1, 3 or all side by side, in worker processes, the first three alone.
+
+    The same frames, hence the same actions, to the last pixel; groups of three find used environments.
+    """
+    chosen, pairs, runs = planner if policy == "planner" else UniformPolicy(*BOX), same_room_pairs(), []
+    for seed, settings in enumerate(({"num_envs": 7}, {"num_envs": 1}, {"num_envs": 3}, {"num_envs": 3, "num_workers": 2})):
+        torch.manual_seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        runs.append(evaluate(chosen, pairs, record=len(pairs), **settings))
     for other in runs[1:]:
         assert np.array_equal(other.success, runs[0].success) and len(other.frames) == len(pairs)
         assert same_frames(other.frames, runs[0].frames) and same_frames(other.goals, runs[0].goals)
     part = evaluate(chosen, make_pairs(pairs.start_state[:3], pairs.goal_state[:3]), record=3)
     assert same_frames(part.frames, runs[0].frames[:3])
-
-
-def test_worker_processes_change_nothing():
-    """Six pairs, three at a time in two processes; the second three find used environments."""
-    pairs = same_room_pairs(6)
-    here, there = (evaluate(UniformPolicy(*BOX), pairs, num_workers=n, num_envs=3, record=6) for n in (None, 2))
-    assert np.array_equal(here.success, there.success)
-    assert same_frames(here.frames, there.frames)
-
-
-def test_the_global_random_state_takes_no_part(planner):
-    pairs = same_room_pairs(3)
-    runs = []
-    for seed in (0, 1):
-        torch.manual_seed(seed)
-        np.random.seed(seed)  # noqa: NPY002
-        runs.append([evaluate(policy, pairs, record=3) for policy in (planner, UniformPolicy(*BOX))])
-    assert all(same_frames(first.frames, second.frames) for first, second in zip(*runs))
 
 
 def test_the_random_baseline_is_uniform_between_the_bounds_and_seeded():
@@ -123,6 +111,25 @@ def test_a_summary_is_plain_json(planner, record):
     assert json.loads(json.dumps(summary, allow_nan=False)) == {**summary, "success_interval": [*summary["success_interval"]]}
     assert summary["pairs"] == 3 and summary["budget"] == 8 and summary["pairs_hash"] == pairs.hash
     assert outcome.seconds_per_plan > 0 == evaluate(UniformPolicy(*BOX), pairs).seconds_per_plan  # which does not plan
+
+
+@pytest.mark.parametrize(("history", "receding", "frames"), [(1, 2, 2), (1, 1, 4), (2, 2, 4)])
+def test_only_frames_that_are_read_or_recorded_are_drawn(monkeypatch, tiny_world, history, receding, frames):
+    """Budget 7, blocks of 2: one frame for each plan, or each block with a history. The actions do not depend on it."""
+    draws, actions = [], []
+    draw, move = TwoRoomEnv._draw, TwoRoomEnv._step_physics
+    monkeypatch.setattr(TwoRoomEnv, "_draw", lambda env, state: draws.append(1) or draw(env, state))
+    monkeypatch.setattr(TwoRoomEnv, "_step_physics", lambda env, a: actions.append(a.tolist()) or move(env, a))
+    config = CEMConfig(num_candidates=16, num_elites=4, iterations=2, horizon=2, receding_horizon=receding)
+    policy = MPCPolicy(LatentCEMPlanner(tiny_world(history=history), config, action_bounds=BOX))
+    pairs = same_room_pairs(3)
+    for record, drawn in ((0, frames), (3, 8)):
+        evaluate(policy, pairs, budget=7, record=record)
+        assert len(draws) == 3 * (drawn + 1)  # and the goal
+        draws.clear()
+    assert actions[:21] == actions[21:]
+    evaluate(UniformPolicy(*BOX), pairs, budget=7)
+    assert len(draws) == 3 * 2
 
 
 def test_recorded_frames_are_the_rendered_states():

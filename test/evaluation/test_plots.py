@@ -64,9 +64,10 @@ def test_what_cannot_be_drawn_is_refused(tmp_path):
 
 
 def test_plots_are_pictures_of_the_size_they_should_have(tmp_path):
-    """Two loss terms: two panels, 3.4 inches each at 120 dots per inch; none of it is blank."""
-    rows = ["step,split,grad_norm,loss_pred,loss_sigreg", *(f"{step},train,1.0,{1 / step},{2 / step}" for step in range(1, 20))]
-    (tmp_path / "metrics.csv").write_text("\n".join([*rows, "19,validation,,0.1,0.2"]))
+    """Two loss terms that are not zero: two panels, 3.4 inches each at 120 dots per inch; none of it is blank."""
+    rows = ["step,split,grad_norm,loss_idm,loss_pred,loss_sigreg"]
+    rows += [f"{step},train,1.0,{1 / step},{2 / step},0" for step in range(1, 20)]
+    (tmp_path / "metrics.csv").write_text("\n".join([*rows, "19,validation,,0.1,0.2,0"]))
     plot_learning_curve(tmp_path / "metrics.csv", tmp_path / "curve.png")
     distances = np.random.default_rng(0).uniform(size=(2, 1000))
     plot_latent_distance(DistanceProfile(*distances), tmp_path / "distance.png")

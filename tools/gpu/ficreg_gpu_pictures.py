@@ -35,7 +35,7 @@ def draw_pictures(out: Path, runs: Runs, profile: dict[str, Any] | None) -> None
 
 
 def draw_success(results: dict[tuple[str, str], dict[str, Any]], target: Path) -> None:
-    """Success rates with 95 % intervals, a panel per environment, the random baseline as a line."""
+    """Shares of goals ever reached with 95 % intervals, and reached at the end (dots); the random baseline as a line."""
     environments = sorted({env for env, _ in results})
     figure, axes = pyplot.subplots(1, len(environments), figsize=(3.2 * len(environments), 3.2), squeeze=False)
     for axis, env in zip(axes[0], environments):
@@ -46,6 +46,7 @@ def draw_success(results: dict[tuple[str, str], dict[str, Any]], target: Path) -
             low, high = outcome["success_interval"]
             rate = outcome["success_rate"]
             axis.bar(place, rate, color=color, yerr=[[rate - low], [high - rate]], capsize=4)
+            axis.plot(place, outcome["success_rate_at_end"], "o", color="white", markeredgecolor="black")
             axis.axhline(random["success_rate"], color="black", ls=":", lw=1)
         axis.set(title=env, xticks=range(len(COLORS)), xticklabels=COLORS, ylim=(0, 1), ylabel="success rate")
     save(figure, target)

@@ -19,6 +19,7 @@ HISTORY, BLOCK = 3, 10  # latents that the predictor takes; width of an action b
 # title: class, kind of inverse model, arguments
 LOSSES = {
     "LeWMLoss": (LeWMLoss, None, {}),
+    "LeWMLoss, prediction_steps=3": (LeWMLoss, None, {"prediction_steps": 3}),
     'FICRegLoss, context="detached"': (FICRegLoss, "mlp", {}),
     'FICRegLoss, context="live"': (FICRegLoss, "mlp", {"context": "live"}),
     'FICRegLoss, consistency="trusted"': (FICRegLoss, "mlp", {"consistency": "trusted"}),

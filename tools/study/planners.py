@@ -47,7 +47,10 @@ def main() -> None:
         table = tables.setdefault(run.name, {})
         for name in names:
             table[name] = evaluate(run, [*SEARCHES[name], *arguments.override])
-            print(f"{run.name:<32}{name:<26}{table[name]['success_rate']:>8.1%}{table[name]['seconds']:>9.3f} s")
+            print(
+                f"{run.name:<32}{name:<26}{table[name]['success_rate']:>8.1%} ever"
+                f"{table[name]['success_rate_at_end']:>8.1%} at the end{table[name]['seconds']:>9.3f} s"
+            )
             arguments.out.write_text(json.dumps(tables, indent=2) + "\n")
     draw(tables, arguments.out.with_suffix(".png"))
 
@@ -81,7 +84,7 @@ def call(script: str, *overrides: str) -> None:
 
 
 def draw(tables: dict, target: Path) -> None:
-    """One panel for each run: success over seconds of planning in an episode."""
+    """One panel for each run: goals ever reached (filled) and reached at the end over seconds of planning in an episode."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -92,10 +95,11 @@ def draw(tables: dict, target: Path) -> None:
         for name, row in table.items():
             low, high = row["success_interval"]
             rate = row["success_rate"]
-            axis.errorbar(row["seconds"], rate, [[max(0.0, rate - low)], [max(0.0, high - rate)]], fmt="o", capsize=2, lw=0.8)
+            marks = axis.errorbar(row["seconds"], rate, [[max(0.0, rate - low)], [max(0.0, high - rate)]], fmt="o", capsize=2, lw=0.8)
+            axis.plot(row["seconds"], row["success_rate_at_end"], "o", mfc="none", color=marks[0].get_color())
             axis.annotate(name, (row["seconds"], rate), xytext=(6, 4), textcoords="offset points", fontsize=7)
         axis.axhline(next(iter(table.values()))["random"], color="grey", ls=":", lw=1)
-        axis.set(title=run, xscale="log", xlabel="seconds of planning in an episode", ylabel="success", ylim=(0, 1.05))
+        axis.set(title=run, xscale="log", xlabel="seconds of planning in an episode", ylabel="success: ever (filled), at the end", ylim=(0, 1.05))
         axis.grid(alpha=0.3)
     figure.tight_layout()
     figure.savefig(target, dpi=110)

@@ -34,20 +34,28 @@ def main(name: str, pattern: str) -> None:
             "steps": result["training"]["steps"],
             "versions": result["versions"],
         }
-        solved, total = pooled.get(method, (0, 0))
-        pooled[method] = (solved + round(outcome["success_rate"] * outcome["pairs"]), total + outcome["pairs"])
+        counts = (round(outcome[rate] * outcome["pairs"]) for rate in ("success_rate", "success_rate_at_end"))
+        pooled[method] = [sum(pair) for pair in zip(pooled.get(method, (0, 0, 0)), (*counts, outcome["pairs"]))]
     if len(hashes) != 1:
         sys.exit(f"error: {len(runs)} runs on {len(hashes)} sets of pairs; all must share one. Pattern: {pattern}")
     summary = {
-        method: {"success_rate": solved / total, "pairs": total, "success_interval": wilson_interval(solved, total)}
-        for method, (solved, total) in pooled.items()
+        method: {
+            "success_rate": solved / total,
+            "success_interval": wilson_interval(solved, total),
+            "success_rate_at_end": at_end / total,
+            "pairs": total,
+        }
+        for method, (solved, at_end, total) in pooled.items()
     }
     RESULTS.mkdir(parents=True, exist_ok=True)
     target = RESULTS / f"{name}.json"
     target.write_text(json.dumps({"pairs_hash": hashes.pop(), "pooled": summary, "runs": runs}, indent=2) + "\n")
     for method, row in summary.items():
         low, high = row["success_interval"]
-        sys.stdout.write(f"{method}: {row['success_rate']:.1%} ({low:.1%} - {high:.1%}) of {row['pairs']}\n")
+        sys.stdout.write(
+            f"{method}: {row['success_rate']:.1%} ever ({low:.1%} - {high:.1%}), "
+            f"{row['success_rate_at_end']:.1%} at the end, of {row['pairs']}\n"
+        )
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,9 +16,10 @@ from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from torchrl_ficreg.envs import make_env
+from torchrl_ficreg.envs.base import DRAW_EVERY
 from torchrl_ficreg.evaluation.metrics import wilson_interval
 from torchrl_ficreg.evaluation.pairs import StartGoalPairs
-from torchrl_ficreg.keys import ACTION, GOAL_PIXELS, MPC_MEMORY, PIXELS, PLAN_SEED, SUCCESS
+from torchrl_ficreg.keys import ACTION, GOAL_PIXELS, GOAL_STATE, MPC_MEMORY, PIXELS, PLAN_SEED, STATE, SUCCESS
 from torchrl_ficreg.planners.mpc import MPCPolicy
 
 
@@ -36,6 +38,8 @@ class UniformPolicy(TensorDictModuleBase):
         >>> UniformPolicy([-1.0, 2.0], [1.0, 6.0])(TensorDict({}, [3]))["action"].shape
         torch.Size([3, 2])
     """
+
+    frame_interval = sys.maxsize  # it reads no frames
 
     def __init__(self, low: list[float], high: list[float], seed: int = 0) -> None:
         super().__init__()
@@ -89,6 +93,11 @@ class Evaluation:
         """Share of all pairs whose goal is reached after any step."""
         return float(self.ever.mean())
 
+    @property
+    def success_rate_at_end(self) -> float:
+        """Share of all pairs whose goal is reached after the last step."""
+        return float(self.success[:, -1].mean())
+
     def summary(self) -> dict[str, Any]:
         """JSON values: counts, rates in [0, 1], a 95 % interval by :func:`wilson_interval`, steps of first success (-1: none)."""
         open_pairs = ~self.at_start
@@ -100,7 +109,7 @@ class Evaluation:
             "budget": self.success.shape[1] - 1,
             "success_rate": self.success_rate,
             "success_interval": wilson_interval(int(self.ever.sum()), len(self.ever)),
-            "success_rate_at_end": float(self.success[:, -1].mean()),
+            "success_rate_at_end": self.success_rate_at_end,
             "solved_at_start": int(self.at_start.sum()),
             "success_rate_unsolved_at_start": float(solved_open.mean()) if len(solved_open) else None,
             "seconds_per_plan": self.seconds_per_plan,
@@ -125,7 +134,9 @@ def evaluate_mpc(
 
     Episodes continue after success, so that reaching a goal and staying there are counted separately. The outcome of a
     pair depends neither on ``num_envs`` nor on ``num_workers``: the number of the pair is the seed of the environment, and
-    the policy reads it as ``plan_seed``.
+    the policy reads it as ``plan_seed``. Frames that neither the policy reads nor ``record`` keeps are not drawn: a policy
+    that reads every k-th frame only has ``frame_interval = k``, as :class:`~torchrl_ficreg.MPCPolicy` and
+    :class:`UniformPolicy` have.
 
     Args:
         policy (TensorDictModuleBase): reads ``pixels`` and ``goal_pixels``, writes ``action``.
@@ -206,8 +217,17 @@ def _run_group(
     bar: tqdm,
 ) -> tuple[float, int]:
     """Runs the pairs of one group and fills in their rows of ``outcome``; returns seconds in the policy and plans made."""
+    interval = getattr(policy, "frame_interval", 1)
     scenes = [
-        {"seed": int(i), "options": {"state": pairs.start_state[i], "goal_state": pairs.goal_state[i]}} for i in group
+        {
+            "seed": int(i),
+            "options": {
+                STATE: pairs.start_state[i],
+                GOAL_STATE: pairs.goal_state[i],
+                DRAW_EVERY: 1 if i in outcome.recorded else interval,
+            },
+        }
+        for i in group
     ]
     td = env.reset(list_of_kwargs=scenes) if env.batch_size else env.reset(**scenes[0])
     lead = td.batch_size

@@ -22,6 +22,8 @@ def _pyplot():
 def plot_learning_curve(metrics: Path, target: Path) -> None:
     """Plots every loss term of a ``metrics.csv`` on a logarithmic axis: training as a line, validation as dots.
 
+    Terms that are zero throughout, as SIGReg is in a training on latents, are left out.
+
     Args:
         metrics (Path): the table of an :class:`~torchrl_ficreg.trainers.OfflineTrainer`.
         target (Path): PNG file to write.
@@ -39,6 +41,7 @@ def plot_learning_curve(metrics: Path, target: Path) -> None:
                     curves[key][row["split"]].append((int(row["step"]), float(value)))
     except (csv.Error, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{metrics} is damaged ({str(error)[:80]}): restore it, or move it away.") from error
+    curves = {term: splits for term, splits in curves.items() if any(value for rows in splits.values() for _, value in rows)}
     if not curves:
         raise ValueError(f"{metrics} holds no loss: give the metrics.csv of a run that has begun to train.")
     figure, axes = pyplot.subplots(1, len(curves), figsize=(3.4 * len(curves), 2.8), squeeze=False)

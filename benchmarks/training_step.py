@@ -35,8 +35,8 @@ RESULT = Path("training_speed.json")
 ACTIONS = 2
 MODELS = {
     "paper": ModelConfig.preset("paper", predictor_attention_dropout=0.0),
-    "conv": ModelConfig.preset("cpu"),
-    "keypoint": ModelConfig.preset("cpu", encoder="keypoint", history=3),
+    "cpu": ModelConfig.preset("cpu"),
+    "conv": ModelConfig.preset("cpu", encoder="conv", encoder_projector_dim=128, history=1),
 }
 KEPT = 2**31 - 1  # bytes, as OfflineTrainer keeps
 Terms = dict[str, torch.Tensor]

@@ -47,6 +47,7 @@ from torchrl_ficreg.planners import (
     PlanConfig,
     RandomShooting,
     ShootingConfig,
+    StayDistance,
 )
 from torchrl_ficreg.transforms import ActionBlocks, GoalImage
 
@@ -90,6 +91,7 @@ __all__ = [
     "RandomShooting",
     "SIGReg",
     "ShootingConfig",
+    "StayDistance",
     "TemporalStraightness",
     "VarianceHinge",
     "ViTEncoder",

@@ -93,15 +93,15 @@ def _product(dtype: torch.dtype) -> Callable[[], object]:
 
 
 def _convolution(dtype: torch.dtype) -> Callable[[], object]:
-    """The second convolution of the keypoint encoder on 16 frames, forward and backward."""
-    shapes = (16, 32, 32, 32), (64, 32, 4, 4), (16, 64, 16, 16)
+    """A 3 x 3 convolution of the keypoint encoder on 64 frames, forward and backward."""
+    shapes = (64, 32, 16, 16), (32, 32, 3, 3), (64, 32, 16, 16)
     x, weight, above = (
         torch.ones(shape, dtype=dtype, device="cpu").contiguous(memory_format=torch.channels_last) for shape in shapes
     )
-    setting = [2, 2], [1, 1], [1, 1], False, [0, 0], 1  # stride, padding, dilation, transposed, output padding, groups
+    setting = [1, 1], [1, 1], [1, 1], False, [0, 0], 1  # stride, padding, dilation, transposed, output padding, groups
     backward = torch.ops.aten.convolution_backward
     return lambda: (
-        F.conv2d(x, weight, stride=2, padding=1), backward(above, x, weight, None, *setting, [True, True, False])
+        F.conv2d(x, weight, padding=1), backward(above, x, weight, None, *setting, [True, True, False])
     )
 
 

@@ -45,15 +45,15 @@ def spatial_softmax(maps: torch.Tensor) -> torch.Tensor:
 
 
 class KeypointNetwork(nn.Module):
-    """Convolutions at a quarter of the frame's resolution, the position of each map, and a linear layer on the positions.
+    """Patches of 4 x 4 pixels, convolutions on their grid, the position of each map, and a linear layer on the positions.
 
     A latent is a linear function of positions in the frame. This keeps the encoder from filling the latent with ever
     finer functions of the one quantity that is easiest to predict.
 
     Args:
         image_size (int, optional): H = W of the frames, a multiple of 4. Default: ``64``.
-        channels (tuple of int, optional): output channels of the three convolutions before the maps. Default:
-            ``(32, 64, 64)``.
+        channels (tuple of int, optional): channels of the patches and of the two 3 x 3 convolutions before the maps.
+            Default: ``(32, 32, 32)``.
         num_keypoints (int, optional): K, number of maps. Default: ``32``.
         latent_dim (int, optional): D. Default: ``16``.
 
@@ -66,22 +66,22 @@ class KeypointNetwork(nn.Module):
         self,
         *,
         image_size: int = 64,
-        channels: tuple[int, ...] = (32, 64, 64),
+        channels: tuple[int, ...] = (32, 32, 32),
         num_keypoints: int = 32,
         latent_dim: int = 16,
     ) -> None:
         super().__init__()
         if image_size < _STRIDE or image_size % _STRIDE:
-            raise ValueError(f"image_size {image_size} must be a positive multiple of {_STRIDE}, two halvings.")
+            raise ValueError(f"image_size {image_size} must be a positive multiple of {_STRIDE}, the side of a patch.")
         if len(channels) != 3:
-            raise ValueError(f"a keypoint encoder has three convolutions before its maps, got channels {channels}.")
+            raise ValueError(f"a keypoint encoder has three layers before its maps, got channels {channels}.")
         first, second, third = channels
         self.normalize = PixelNormalizer(image_size)
         # Channels last: the layout of bfloat16 convolutions on CPUs.
         self.convolutions = nn.Sequential(
-            nn.Conv2d(3, first, kernel_size=4, stride=2, padding=1),
+            nn.Conv2d(3, first, kernel_size=_STRIDE, stride=_STRIDE),
             nn.GELU(),
-            nn.Conv2d(first, second, kernel_size=4, stride=2, padding=1),
+            nn.Conv2d(first, second, kernel_size=3, padding=1),
             nn.GELU(),
             nn.Conv2d(second, third, kernel_size=3, padding=1),
             nn.GELU(),

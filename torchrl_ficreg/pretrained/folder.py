@@ -208,7 +208,7 @@ def world_model_sizes(model: LatentWorldModel) -> Sizes:
         >>> from torchrl_ficreg import make_world_model, ModelConfig
         >>> model, _ = make_world_model(ModelConfig.preset("cpu"), action_dim=2)
         >>> world_model_sizes(model)["encoder"]["kind"]
-        'conv'
+        'keypoint'
     """
     encoder, predictor = _own_network(model.encoder, _ENCODER_ARGUMENTS), _own_network(model.predictor, (CausalTransformer,))
     kind, *names = _ENCODER_ARGUMENTS[type(encoder)]

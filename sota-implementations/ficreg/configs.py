@@ -21,7 +21,7 @@ import torch
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, MISSING, OmegaConf
 from run_dir import check_writable, flatten
-from utils import describe_env, get_device, make_loss, model_config, plan_config, record_settings
+from utils import clip_frames, describe_env, get_device, make_loss, model_config, plan_config, record_settings, refined
 
 from torchrl_ficreg import LatentWorldModel, make_world_model, ModelConfig
 from torchrl_ficreg.data.dataset import split_episodes, SPLITS
@@ -31,7 +31,6 @@ from torchrl_ficreg.envs.collect import EpisodeRecorder
 from torchrl_ficreg.envs.registry import find_entry
 from torchrl_ficreg.keys import GOAL_STATE, STATE
 from torchrl_ficreg.modules.config import PRESETS
-from torchrl_ficreg.trainers import Refinement
 from torchrl_ficreg.trainers.checkpoint import require_checkpoint_space
 from torchrl_ficreg.trainers.stepper import check_batch_size
 
@@ -101,12 +100,14 @@ class Env:
 
 @dataclasses.dataclass
 class Loss:
-    """``loss``: weights of the terms."""
+    """``loss``: weights of the terms, and the rollouts they are computed on."""
 
     sigreg_coeff: float = MISSING
     sigreg_start: Optional[float] = MISSING
     idm_coeff: float = MISSING
     consistency_coeff: float = MISSING
+    prediction_steps: int = _at_least(1)
+    num_frames: Optional[int] = _at_least(2)
 
 
 @dataclasses.dataclass
@@ -161,9 +162,12 @@ class Evaluation:
 class Refine:
     """``refine``: training on the latents of the frozen encoder."""
 
-    steps: int = MISSING
-    batch_size: int = MISSING
+    epochs: int = _at_least(0)
+    batch_size: int = _at_least(2)
     lr: float = MISSING
+    prediction_steps: Optional[int] = _at_least(1)
+    consistency_steps: Optional[int] = _at_least(1)
+    num_frames: Optional[int] = _at_least(2)
 
 
 @dataclasses.dataclass
@@ -333,7 +337,10 @@ def check_settings(cfg: DictConfig, training: bool = True) -> None:
     check_batch_size(optim.batch_size)
     for _, budget in goals(cfg):
         check_horizon(cfg.plan, cfg.model.frame_skip, budget)
-    Refinement(**cfg.refine)
+    if not cfg.refine.lr > 0:
+        raise ValueError(f"refine.lr must be positive, got {cfg.refine.lr}.")
+    _check_clips(cfg, "loss", "method")
+    _check_clips(refined(cfg), "refine", "refine")
     if cfg.logger.backend != "csv" and find_spec(cfg.logger.backend) is None:
         backend = cfg.logger.backend
         raise ImportError(f"logger.backend={backend} needs a package: pip install {LOGGERS[backend]}.")
@@ -350,8 +357,8 @@ def check_settings(cfg: DictConfig, training: bool = True) -> None:
     epoch = evaluation.epoch
     if epoch is not None and epoch > optim.epochs:
         raise ValueError(f"evaluation.epoch must be null or an epoch from 1 to optim.epochs={optim.epochs}, got {epoch}.")
-    if epoch is not None and cfg.refine.steps:
-        raise ValueError(f"evaluation.epoch={epoch} leaves no use for refine.steps={cfg.refine.steps}: set one to null or 0.")
+    if epoch is not None and cfg.refine.epochs:
+        raise ValueError(f"evaluation.epoch={epoch} leaves no use for refine.epochs={cfg.refine.epochs}: set one to null or 0.")
     local = optim.batch_size // planned_world_size()
     if optim.accumulate > 1 and local % (2 * optim.accumulate):
         raise ValueError(
@@ -367,6 +374,28 @@ def check_settings(cfg: DictConfig, training: bool = True) -> None:
         run_dir = Path(cfg.runs_dir) / cfg.name
         check_writable(run_dir, "runs_dir")
         require_checkpoint_space(run_dir, model.parameters())
+
+
+def _check_clips(cfg: DictConfig, section: str, method_section: str) -> None:
+    """Refuses clips that are shorter than the rollouts of the loss.
+
+    Args:
+        cfg: the whole configuration of a training.
+        section: of ``prediction_steps`` and ``num_frames`` in messages.
+        method_section: of ``consistency_steps`` in messages.
+
+    Raises:
+        ValueError: a rollout is deeper than a clip.
+    """
+    frames = clip_frames(cfg)
+    steps = {f"{section}.prediction_steps": cfg.loss.prediction_steps}
+    steps[f"{method_section}.consistency_steps"] = cfg.method.get("consistency_steps", 1)
+    for name, depth in steps.items():
+        if depth >= frames:
+            raise ValueError(
+                f"{name}={depth} needs clips of at least {depth + 1} frames, {section}.num_frames gives {frames}: raise it, or "
+                "set it to null, which makes clips long enough."
+            )
 
 
 def goals(cfg: DictConfig) -> list[tuple[int, int]]:
@@ -437,11 +466,6 @@ def _check_networks(cfg: DictConfig) -> LatentWorldModel:
         except RuntimeError as error:
             raise ValueError(f"the model settings make no networks ({error}): choose smaller sizes.") from error
         make_loss(cfg, model, inverse_model)
-    if method.get("consistency_steps", 1) > cfg.model.history:
-        raise ValueError(
-            f"method.consistency_steps={method.consistency_steps} is deeper than a clip: give at most "
-            f"model.history={cfg.model.history}, or raise that."
-        )
     if not 0 <= method.get("consistency_warmup", 0.0) <= 1:
         raise ValueError(f"method.consistency_warmup must lie in [0, 1], got {method.consistency_warmup}.")
     params = [*model.parameters(), *inverse_model.parameters()]
@@ -492,13 +516,20 @@ def _check_amounts(cfg: DictConfig) -> None:
         raise ValueError(
             f"env.data.episodes={data.episodes} leave no episode for {' and '.join(empty)}: record more (20 are enough)."
         )
-    clip = cfg.model.history * cfg.model.frame_skip  # environment steps from the first frame to the last
-    clips = episodes["train"] * max(0, rows - clip)
-    if clips < cfg.optim.batch_size:
-        raise ValueError(
-            f"{data.episodes} episodes of at most {data.max_steps} steps make at most {clips} training clips, less than "
-            f"one batch of optim.batch_size={cfg.optim.batch_size}: lower it, or raise env.data.episodes."
-        )
+    phases = [("loss", "optim", cfg)] + ([("refine", "refine", refined(cfg))] if cfg.refine.epochs else [])
+    for section, optim, phase in phases:
+        clip = (clip_frames(phase) - 1) * cfg.model.frame_skip  # environment steps from the first frame to the last
+        if clip >= rows:
+            raise ValueError(
+                f"the clips of {section} are {clip} steps long, episodes at most {data.max_steps}: lower "
+                f"{section}.prediction_steps or {section}.num_frames, or raise env.data.max_steps."
+            )
+        clips = episodes["train"] * (rows - clip)
+        if clips < phase.optim.batch_size:
+            raise ValueError(
+                f"{data.episodes} episodes of at most {data.max_steps} steps make at most {clips} training clips, less than "
+                f"one batch of {optim}.batch_size={phase.optim.batch_size}: lower it, or raise env.data.episodes."
+            )
     wanted = {"evaluation": ("num_pairs", evaluation.num_pairs)}
     if evaluation.every:
         wanted["validation"] = ("every_pairs", evaluation.every_pairs)

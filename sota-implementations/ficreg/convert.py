@@ -27,6 +27,8 @@ def main(cfg: DictConfig) -> None:
         raise ValueError("give both action_low and action_high, or none of them.")
     task = OmegaConf.to_container(cfg.env) if cfg.env is not None else {"name": cfg.env_name, "kwargs": {}}
     state = list(cfg.state) if isinstance(cfg.state, ListConfig) else cfg.state
+    if "detail" in task["kwargs"]:
+        task["kwargs"]["detail"] = "published"  # the default is that of our own recordings
     with open_source(
         cfg.source,
         cfg.format,

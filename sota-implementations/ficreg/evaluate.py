@@ -17,7 +17,7 @@ from cli import entry_point
 from configs import check_consistency, check_horizon
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from results import evaluate_with_random_baseline, report, result_rows
+from results import draw_validation_pairs, evaluate_with_random_baseline, report, result_rows
 from run_dir import claim_folder, flatten, versions, write_json
 from utils import get_device, make_policy, plan_config, settings_of_card
 
@@ -27,6 +27,7 @@ from torchrl_ficreg.evaluation import save_episodes_gif, StartGoalPairs
 from torchrl_ficreg.trainers import exit_on_signal, find_checkpoint, load_world_model
 
 RESULTS = "results.json"
+VALIDATION = "validation"  # in place of a file of pairs
 SHARED = ("checkpoint", "weights", "pairs", "budget")  # settings besides the plan
 MAX_COUNT = 10**6  # of a count in a plan, and of a budget: more comes from a damaged or hostile card
 
@@ -45,13 +46,13 @@ def evaluate(cfg: DictConfig) -> None:
     checkpoint = find_checkpoint(cfg.checkpoint)
     run_dir = checkpoint.parent.parent
     manifest = Path(cfg.pairs or run_dir / "pairs.json")
-    if not manifest.exists():
+    if cfg.pairs != VALIDATION and not manifest.exists():
         raise FileNotFoundError(f"no start-goal pairs at {manifest}: let train.py finish, or give pairs=...")
-    pairs = StartGoalPairs.load(manifest)
     model, inverse_model, card = load_world_model(checkpoint)
+    trained = settings_of_card(card)
+    pairs = draw_validation_pairs(trained, run_dir) if cfg.pairs == VALIDATION else StartGoalPairs.load(manifest)
     if pairs.env != card.env:
         raise ValueError(f"the model was trained on {card.env}, the pairs belong to {pairs.env}: give others, pairs=...")
-    trained = settings_of_card(card)
     plan = plan_of_run(cfg, trained)
     budget = cfg.budget or trained.env.get("budget")
     check_sizes(plan, budget)

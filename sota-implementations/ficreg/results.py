@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from run_dir import flatten, is_writable
+from run_dir import flatten, is_writable, recorded_paths, REFINE
 from torchrl import torchrl_logger
 from torchrl.record.loggers import get_logger, Logger
-from utils import make_dataset, make_policy
+from utils import dataset_path, make_dataset, make_policy
 
 from torchrl_ficreg import InverseDynamicsModel, LatentWorldModel, MPCPolicy
 from torchrl_ficreg._utils import read_bytes, write_atomic
 from torchrl_ficreg.data import EpisodeStore
+from torchrl_ficreg.data.shards import open_store
 from torchrl_ficreg.envs.registry import find_entry
 from torchrl_ficreg.evaluation import (
     evaluate_mpc,
@@ -67,8 +68,46 @@ def draw_tests(
     return tests
 
 
+def find_dataset(trained: DictConfig, run_dir: Path) -> Path:
+    """The folder of a run's dataset, by its place relative to the run or to the working directory.
+
+    Args:
+        trained: the configuration of the run.
+        run_dir: its folder.
+
+    Raises:
+        FileNotFoundError: it is not there.
+    """
+    named, recorded = trained.get("dataset"), recorded_paths(run_dir)
+    own = dataset_path(trained) if named is None else Path(named).expanduser()
+    places = [own]
+    if named is not None and "dataset" in recorded:
+        places.insert(0, recorded["dataset"])
+    elif named is None and "data_dir" in recorded:
+        places.insert(0, recorded["data_dir"] / own.name)
+    for path in places:
+        if path.is_dir():
+            return path.resolve()
+    raise FileNotFoundError(f"the episodes of the run are not at {places[0]}: put them there.")
+
+
+def draw_validation_pairs(trained: DictConfig, run_dir: Path) -> StartGoalPairs:
+    """As many start-goal pairs as a run is evaluated on, from the validation episodes of its dataset.
+
+    Args:
+        trained: the configuration of the run.
+        run_dir: its folder.
+
+    Raises:
+        FileNotFoundError: the dataset is not where it was at training.
+    """
+    data = open_store(find_dataset(trained, run_dir))
+    settings, held_out = trained.evaluation, make_dataset(trained, data, "validation")
+    return StartGoalPairs.draw(held_out, trained.env.name, settings.num_pairs, trained.env.goal_offset, settings.seed)
+
+
 def validate(cfg: DictConfig, data: EpisodeStore, card: ModelCard, run_dir: Path, networks: Networks) -> dict[str, float]:
-    """The success rate on pairs of the validation split, by which the best checkpoint is chosen."""
+    """Success rates on pairs of the validation split; the best checkpoint is chosen by the first, of goals ever reached."""
     settings = cfg.evaluation
     held_out = make_dataset(cfg, data, "validation")
     outcome = evaluate_mpc(
@@ -81,7 +120,7 @@ def validate(cfg: DictConfig, data: EpisodeStore, card: ModelCard, run_dir: Path
         env_kwargs=card.env_kwargs,
         progress_bar=False,
     )
-    return {"success_rate": outcome.success_rate}
+    return {"success_rate": outcome.success_rate, "success_rate_at_end": outcome.success_rate_at_end}
 
 
 def evaluate_tests(
@@ -114,8 +153,9 @@ def evaluate_tests(
         report([(f"{cfg.method.name}, {cfg.plan.search}", rows["policy"], ""), ("random", rows["random"], "")])
     profile = latent_distance(networks[0], make_dataset(cfg, data, "evaluation"))
     try:
-        if (run_dir / METRICS).exists():
-            plot_learning_curve(run_dir / METRICS, run_dir / "learning_curve.png")
+        for folder in (run_dir, run_dir / REFINE):
+            if (folder / METRICS).exists():
+                plot_learning_curve(folder / METRICS, folder / "learning_curve.png")
         plot_latent_distance(profile, run_dir / "latent_distance.png", unit=cfg.env.state_unit)
         save_episodes_gif(first, run_dir / "episodes.gif")
     except ImportError as error:  # the plot extra is optional
@@ -141,7 +181,7 @@ def result_rows(method: str, plan: DictConfig, outcome: Evaluation, random_basel
 
 
 def report(rows: list[tuple[str, dict[str, Any], str]]) -> None:
-    """Prints a table of success rates.
+    """Prints a table of success rates: of goals ever reached, with its interval, and of those reached at the end.
 
     Args:
         rows: name, summary and differing settings of each policy; the first one is the one just evaluated, the last one
@@ -149,7 +189,7 @@ def report(rows: list[tuple[str, dict[str, Any], str]]) -> None:
     """
     width = max(14, *(len(name) + 2 for name, _, _ in rows))
     print(
-        f"\n{'policy':<{width}}{'success':>8}{'95 % interval':>18}{'at the end':>12}{'of those not solved at start':>30}"
+        f"\n{'policy':<{width}}{'ever':>8}{'95 % interval':>18}{'at the end':>12}{'of those not solved at start':>30}"
         f"{'s / plan':>10}" + ("  settings that differ" if any(note for _, _, note in rows) else "")
     )
     for name, row, note in rows:

@@ -41,13 +41,15 @@ checkpoints/          the latest two, and the best one if evaluation.every is se
                       state, position in the data, action statistics and configuration. torchrl.checkpoint opens them;
                       torchrl_ficreg.trainers.load_world_model returns the model. epoch-* is the one evaluated in
                       results.json, if evaluation.epoch is set
+refine/               checkpoints and metrics.csv of the training on latents of the frozen encoder, if refine.epochs is set;
+                      when it is done, the last checkpoint above has its weights
 config.yaml           all settings, resolved; from_run_dir: paths of the data relative to this folder
 metrics.csv           losses, gradient norms, collapse diagnostics, throughput and memory every few steps; losses of
                       validation clips after every epoch
 pairs.json            starts and goals of the evaluation; pairs_*.json of the further tests of evaluation.also
 results.json          success rates with confidence intervals, training time, versions of the packages
 episodes.gif          rollouts of the planner
-learning_curve.png    losses against steps
+learning_curve.png    losses against steps; that of refine/ is in there
 latent_distance.png   distance in latent space against true distance
 evaluation/           results of evaluate.py, in folders <search>_<hash of its settings>: results.json, config.yaml and
                       episodes.gif
@@ -55,10 +57,17 @@ goal_policy/          the policy of train_policy.py
 wandb/, tensorboard/  files of the logger, if one is set
 """
 
+REFINE = "refine"  # folder of the second phase, in the run directory
+
 # Settings that do not influence the weights: a run may be continued with other values.
 _NOT_IN_FINGERPRINT = ("collect.", "distributed.", "device", "evaluation.", "plan.", "logger.", "resume")
 _NOT_IN_FINGERPRINT += ("optim.checkpoint_activations",)  # not optim.compile: a compiled graph draws other dropout masks
 _NOT_IN_FINGERPRINT += ("env.budget", "env.goal_offset", "env.num_workers", "env.state_unit")
+# Settings that came after or went since a run was made, and the value that means what the run did.
+_ADDED = {"refine.epochs": 0, "loss.prediction_steps": 1}
+_REMOVED = {"refine.steps": 0}
+# Settings that only one encoder reads; the networks of another do not depend on them.
+_OF_ENCODER = {"conv": ("model.conv_channels",), "keypoint": ("model.keypoint_channels", "model.num_keypoints")}
 _PATHS = ("data_dir", "dataset")
 _DAMAGE = (ValueError, TypeError, AttributeError, AssertionError, RecursionError)  # errors of a damaged config.yaml
 _FROM_RUN_DIR = "from_run_dir"  # entry of config.yaml: _PATHS relative to the run directory
@@ -71,7 +80,7 @@ def check_run_dir(cfg: DictConfig) -> Path:
         ValueError: it holds a run of another configuration, or any run under ``resume=never``.
     """
     run_dir, ours = Path(cfg.runs_dir) / cfg.name, OmegaConf.to_container(cfg, resolve=True)
-    for name in (CHECKPOINTS, "wandb", "tensorboard"):  # a copied folder may contain links
+    for name in (CHECKPOINTS, REFINE, f"{REFINE}/{CHECKPOINTS}", "wandb", "tensorboard"):  # a copied folder may contain links
         if (run_dir / name).is_symlink():
             raise ValueError(f"{run_dir / name} is a link, through which nothing is written: remove it, or give another name=...")
     path = run_dir / "config.yaml"
@@ -106,6 +115,18 @@ def _read_config(path: Path) -> dict[str, Any]:
     return config
 
 
+def recorded_paths(run_dir: Path) -> dict[str, Path]:
+    """``data_dir`` and ``dataset`` of a run, found from its folder wherever a command is started; empty if it holds neither.
+
+    Raises:
+        ValueError: its config.yaml is damaged.
+    """
+    path = run_dir / "config.yaml"
+    recorded = _read_config(path).get(_FROM_RUN_DIR) if path.exists() else None
+    recorded = recorded if isinstance(recorded, dict) else {}
+    return {key: run_dir / recorded[key] for key in _PATHS if isinstance(recorded.get(key), str)}
+
+
 def _from_run_dir(config: dict[str, Any], run_dir: Path) -> dict[str, str]:
     """The paths of the data relative to the run directory, which do not depend on the working directory."""
     paths = {key: Path(config[key]).resolve() for key in _PATHS if config[key] is not None}
@@ -133,8 +154,10 @@ def _unify_paths(
 
 def _differences(ours: dict[str, Any], theirs: dict[str, Any], free: tuple[str, ...] = ()) -> str:
     """The first three settings that differ, as text; empty if only settings outside the fingerprint do."""
-    ours, theirs = flatten(ours), flatten(theirs)
-    keys = [key for key in sorted(ours | theirs) if not key.startswith((*_NOT_IN_FINGERPRINT, *free))]
+    ours, theirs = ({**_ADDED, **flatten(settings)} for settings in (ours, theirs))
+    theirs = {key: value for key, value in theirs.items() if key in ours or value != _REMOVED.get(key)}
+    unused = [key for kind, keys in _OF_ENCODER.items() if kind != ours.get("model.encoder") for key in keys]
+    keys = [key for key in sorted(ours | theirs) if not key.startswith((*_NOT_IN_FINGERPRINT, *free, *unused))]
     differ = [key for key in keys if ours.get(key) != theirs.get(key)]
     return ", ".join(f"{key}: {str(theirs.get(key))[:60]} -> {str(ours.get(key))[:60]}" for key in differ[:3])
 

@@ -25,13 +25,23 @@ from cli import entry_point
 from configs import check_settings, goals
 from omegaconf import DictConfig
 from results import draw_tests, evaluate_tests, log_results, make_logger, Networks, validate
-from run_dir import check_run_dir, claim_run_dir, find_start, versions, write_json
-from utils import add_hooks, encoder_of, get_device, make_card, make_dataset, make_loss, model_config, open_dataset
+from run_dir import check_run_dir, claim_run_dir, find_start, REFINE, versions, write_json
+from utils import (
+    add_hooks,
+    get_device,
+    make_card,
+    make_dataset,
+    make_loss,
+    model_config,
+    open_dataset,
+    refine,
+    refined,
+    trainer_settings,
+)
 
 from torchrl_ficreg import make_world_model
 from torchrl_ficreg._device import describe_precision
 from torchrl_ficreg.data import EpisodeStore
-from torchrl_ficreg.data.latents import encode_episodes, LatentClips
 from torchrl_ficreg.distributed import is_main, process_group, rank, world_size
 from torchrl_ficreg.pretrained import ModelCard
 from torchrl_ficreg.trainers import (
@@ -39,12 +49,11 @@ from torchrl_ficreg.trainers import (
     EvaluationHook,
     load_world_model,
     OfflineTrainer,
+    PhaseLogger,
     Refinement,
     stop_on_signal,
     TolerantLogger,
 )
-
-_NON_TRAINER_KEYS = ("batch_size", "checkpoint_activations")  # of optim: settings of the dataset and of the networks
 
 
 @entry_point("train")
@@ -55,6 +64,8 @@ def main(cfg: DictConfig) -> None:
     data = open_dataset(cfg)  # under torchrun one process records while the others wait for its lock
     card = make_card(cfg, make_dataset(cfg, data, "train"))
     make_dataset(cfg, data, "validation")  # refuses a split without episodes
+    for split in ("train", "validation") if cfg.refine.epochs else ():
+        make_dataset(refined(cfg), data, split)  # refuses clips longer than every episode, or fewer than a batch
     tests = draw_tests(cfg, data, card.env_kwargs, goals(cfg)) if is_main() else []
     with claim_run_dir(cfg) as run_dir:
         logger = make_logger(cfg, run_dir) if is_main() else None
@@ -79,7 +90,7 @@ def train(
         clips = make_dataset(cfg, data, "train", prefetch=1, **shard)
         model, inverse_model = make_world_model(model_config(cfg), card.action_dim)
         model.statistics = clips.statistics
-        refinement = Refinement(seed=cfg.seed, precision=cfg.optim.precision, **cfg.refine)
+        refinement = Refinement(done=not cfg.refine.epochs)
         trainer = OfflineTrainer(
             make_loss(cfg, model.to(device), inverse_model.to(device)),
             clips,
@@ -89,7 +100,7 @@ def train(
             log_interval=cfg.logger.interval,
             logger=logger,
             keep_epoch=cfg.evaluation.epoch,
-            **{key: value for key, value in cfg.optim.items() if key not in _NON_TRAINER_KEYS},
+            **trainer_settings(cfg),
         )
         add_hooks(cfg, trainer)
         success = EvaluationHook(
@@ -105,7 +116,9 @@ def train(
         with stop_on_signal(trainer, signal.SIGTERM, signal.SIGINT):
             trainer.train()
     if not refinement.done and is_main():
-        refine(cfg, data, (model, inverse_model), refinement)
+        later = PhaseLogger(logger, "refine/", trainer.collected_frames) if logger else None
+        refinement.seconds = refine(cfg, data, (model, inverse_model), run_dir / REFINE, later)
+        refinement.done = True
         success.forget()
         trainer.save_trainer(force_save=True)
     if trainer.kept is not None and is_main() and cfg.evaluation.epoch < cfg.optim.epochs:
@@ -116,20 +129,12 @@ def train(
         "clips": len(clips),
         "resumed_at_step": resumed_at,
         "seconds": trainer.clock.seconds,
-        "refinement_steps": refinement.steps,
+        "refinement_epochs": cfg.refine.epochs,
         "refinement_seconds": refinement.seconds,
         "parameters": sum(p.numel() for p in model.parameters()),
         "dataset_fingerprint": clips.fingerprint,
     }
     return (model.eval(), inverse_model.eval()), training
-
-
-def refine(cfg: DictConfig, data: EpisodeStore, networks: Networks, refinement: Refinement) -> None:
-    """Trains predictor and inverse model further, on latents of the frozen encoder."""
-    model, inverse_model = networks
-    clips = make_dataset(cfg, data, "train", statistics=model.statistics)
-    latent = encode_episodes(clips, encoder_of(model.eval(), cfg.optim.precision), description="encode")
-    refinement.run(make_loss(cfg, model, inverse_model), LatentClips(clips, latent))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -33,10 +34,12 @@ from torchrl_ficreg import (
     PlanConfig,
     PLDMLoss,
     SIGReg,
+    StayDistance,
 )
 from torchrl_ficreg._device import autocast, Precision
 from torchrl_ficreg._utils import require_space
 from torchrl_ficreg.data import EpisodeStore, EpisodeWriter, estimate_bytes, OfflineTrajectories
+from torchrl_ficreg.data.latents import encode_episodes
 from torchrl_ficreg.data.layout import META_FILE
 from torchrl_ficreg.data.shards import open_store, shard_paths
 from torchrl_ficreg.envs import collect_episodes, collect_on_ray, make_env
@@ -45,11 +48,12 @@ from torchrl_ficreg.modules.goal_policy import CONFIG_FILE, load_goal_policy, WE
 from torchrl_ficreg.modules.transformer import checkpoint_activations
 from torchrl_ficreg.planners import SEARCHES
 from torchrl_ficreg.pretrained import ModelCard
-from torchrl_ficreg.trainers import CoefficientSchedule, CollapseMonitor, OfflineTrainer
+from torchrl_ficreg.trainers import CoefficientSchedule, CollapseMonitor, OfflineTrainer, PhaseLogger, stop_on_signal
 
+DETAIL = "detail"  # the argument of environments that chooses how pictures are drawn
 SIGREG_DECAY_FRACTION = 0.8  # share of training after which lambda has its last value
-COSTS = {"goal": GoalDistance, "path": PathDistance}
-COST_FIELDS = ("cost", "effort", "consistency")  # of the plan group; the rest are fields of the search's configuration
+COSTS = {"goal": GoalDistance, "path": PathDistance, "stay": StayDistance}
+COST_FIELDS = ("cost", "stay_discount", "effort", "consistency")  # of the plan group; the rest are fields of the search's configuration
 
 
 # Dataset
@@ -90,7 +94,11 @@ def open_dataset(cfg: DictConfig) -> EpisodeStore:
         )
     ours, theirs = OmegaConf.to_container(cfg.env.kwargs), store.header.meta.get("env_kwargs")
     theirs = theirs if isinstance(theirs, dict) else {}  # make_card() refuses anything else
-    differ = [f"{key}={theirs[key]}, not {value}" for key, value in ours.items() if theirs.get(key, value) != value]
+    differ = [
+        f"{key}={theirs[key]}, not {value}"
+        for key, value in ours.items()
+        if theirs.get(key, value) != value and key != DETAIL  # make_card() takes the dataset's
+    ]
     if differ:
         torchrl_logger.warning(
             f"dataset={cfg.dataset} was made with {'; '.join(differ)}: the run is evaluated with its own env.kwargs."
@@ -171,7 +179,7 @@ def make_dataset(cfg: DictConfig, data: EpisodeStore | Path, split: str, **chang
     """One split of a dataset as clips for the model of a configuration; splits of one store share its files."""
     settings = {
         "split": split,
-        "num_frames": cfg.model.history + 1,
+        "num_frames": clip_frames(cfg),
         "frame_skip": cfg.model.frame_skip,
         "batch_size": cfg.optim.batch_size,
         "drop_last": split == "train",
@@ -179,6 +187,13 @@ def make_dataset(cfg: DictConfig, data: EpisodeStore | Path, split: str, **chang
         "pin_memory": True,  # no effect without a CUDA device
     }
     return OfflineTrajectories(data, **{**settings, **changes})
+
+
+def clip_frames(cfg: DictConfig) -> int:
+    """T, frames of a clip: ``loss.num_frames``, or so many that the deepest rollout can start from a whole history."""
+    loss = cfg.get("loss", {})  # which the cards of earlier runs may lack, or its newer fields
+    given, steps = loss.get("num_frames"), max(loss.get("prediction_steps", 1), cfg.method.get("consistency_steps", 1))
+    return cfg.model.history + steps if given is None else given
 
 
 def describe_env(cfg: DictConfig) -> tuple[list[float], list[float], int]:
@@ -233,15 +248,35 @@ def make_loss(cfg: DictConfig, model: LatentWorldModel, inverse_model: InverseDy
         checkpoint_activations(model)
     name, weights = cfg.method.name, cfg.loss
     settings = {key: value for key, value in cfg.method.items() if key not in ("name", "consistency_warmup")}
+    settings["prediction_steps"] = weights.get("prediction_steps", 1)
     sigreg = SIGReg(seed=cfg.seed).to(next(model.parameters()).device)
     if name == "lewm":
-        return LeWMLoss(*networks[:2], sigreg=sigreg, sigreg_coeff=weights.sigreg_coeff)
+        return LeWMLoss(*networks[:2], sigreg=sigreg, sigreg_coeff=weights.sigreg_coeff, **settings)
     settings |= {} if name == "pldm" else {"sigreg": sigreg, "sigreg_coeff": weights.sigreg_coeff, "idm_coeff": weights.idm_coeff}
     settings |= {"consistency_coeff": weights.consistency_coeff} if name == "ficreg" else {}
     kinds = {"ficreg": FICRegLoss, "joint_inverse": JointInverseLoss, "pldm": PLDMLoss}
     if name not in kinds:
         raise ValueError(f"method.name={name} is unknown: leave it out, and choose by method=.")
     return kinds[name](*networks, **settings)
+
+
+def trainer_settings(cfg: DictConfig) -> dict[str, Any]:
+    """Arguments of :class:`~torchrl_ficreg.trainers.OfflineTrainer` in ``optim``, which also has others' settings."""
+    return {key: value for key, value in cfg.optim.items() if key not in ("batch_size", "checkpoint_activations")}
+
+
+def refined(cfg: DictConfig) -> DictConfig:
+    """The configuration of the training on latents: settings of ``refine`` in place of others."""
+    changed, own = cfg.copy(), cfg.refine
+    changed.optim.update({"epochs": own.epochs, "batch_size": own.batch_size, "lr": own.lr})
+    changed.optim.update({"schedule_epochs": None, "accumulate": 1, "compile": False})
+    if own.prediction_steps is not None:
+        changed.loss.prediction_steps = own.prediction_steps
+    if own.consistency_steps is not None and "consistency_steps" in changed.method:
+        changed.method.consistency_steps = own.consistency_steps
+    if own.num_frames is not None or own.prediction_steps is not None or own.consistency_steps is not None:
+        changed.loss.num_frames = own.num_frames  # null: as long as its own steps need
+    return changed
 
 
 def encoder_of(model: LatentWorldModel, precision: Precision) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -253,6 +288,50 @@ def encoder_of(model: LatentWorldModel, precision: Precision) -> Callable[[torch
             return model.encode(pixels.to(device))
 
     return encode
+
+
+def refine(
+    cfg: DictConfig,
+    data: EpisodeStore,
+    networks: tuple[LatentWorldModel, InverseDynamicsModel],
+    folder: Path,
+    logger: PhaseLogger | None,
+) -> float:
+    """Trains predictor and inverse model further, on latents of the frozen encoder, and returns the seconds it took.
+
+    Raises:
+        FloatingPointError: a loss or a gradient is not finite.
+        ValueError: ``folder`` holds checkpoints of another encoder.
+    """
+    (model, inverse_model), cfg = networks, refined(cfg)
+    encode, clips = encoder_of(model.eval(), cfg.optim.precision), {}
+    for split in ("train", "validation"):
+        frames = make_dataset(cfg, data, split, statistics=model.statistics)
+        latent = encode_episodes(frames, encode, description=f"encode {split}")
+        ahead = 1 if split == "train" else None
+        clips[split] = make_dataset(cfg, data, split, statistics=model.statistics, latent=latent, prefetch=ahead)
+    trainer = OfflineTrainer(
+        make_loss(cfg, model, inverse_model),
+        clips["train"],
+        run_dir=folder,
+        validation_buffer=clips["validation"],
+        log_interval=cfg.logger.interval,
+        logger=logger,
+        description="refine",
+        **trainer_settings(cfg),
+    )
+    encoder = {name: value.clone() for name, value in model.encoder.state_dict().items()}
+    resumed = trainer.resume()
+    if not all(value.equal(encoder[name]) for name, value in model.encoder.state_dict().items()):
+        raise ValueError(f"{folder} is a training on latents of another encoder: move it away, and the same command begins anew.")
+    if resumed and trainer.step < trainer.total_steps:
+        print(f"continuing {folder} after step {trainer.step} of {trainer.total_steps}")
+    try:
+        with stop_on_signal(trainer, signal.SIGTERM, signal.SIGINT):
+            trainer.train()
+    except FloatingPointError as error:
+        raise FloatingPointError(f"refine, {error}") from error
+    return trainer.clock.seconds
 
 
 def add_hooks(cfg: DictConfig, trainer: OfflineTrainer) -> None:
@@ -297,10 +376,14 @@ def make_card(cfg: DictConfig, dataset: OfflineTrajectories) -> ModelCard:
         )
     if not isinstance(meta["env_kwargs"], dict):
         raise ValueError(f"{where} notes env_kwargs={str(meta['env_kwargs'])[:60]}: expected names and values of settings.")
+    env_kwargs = {**meta["env_kwargs"], **OmegaConf.to_container(cfg.env.kwargs)}
+    env_kwargs.pop(DETAIL, None)  # an evaluation draws as the recording did, by default where the dataset notes no detail
+    if DETAIL in meta["env_kwargs"]:
+        env_kwargs[DETAIL] = meta["env_kwargs"][DETAIL]
     card = ModelCard(
         model=asdict(model_config(cfg)),
         env=meta["env"],
-        env_kwargs={**meta["env_kwargs"], **OmegaConf.to_container(cfg.env.kwargs)},
+        env_kwargs=env_kwargs,
         action_low=low.tolist(),
         action_high=high.tolist(),
         config=OmegaConf.to_container(cfg, resolve=True),
@@ -348,7 +431,9 @@ def plan_config(plan: DictConfig) -> PlanConfig:
         raise ValueError(f"unknown plan.search {search!r}: choose one of {sorted(SEARCHES)}.")
     if values.get("cost", "goal") not in COSTS:
         raise ValueError(f"unknown plan.cost {values['cost']!r}: choose one of {sorted(COSTS)}.")
-    wrong = [f"plan.{name}={values[name]}" for name in COST_FIELDS[1:] if not 0 <= values.get(name, 0.0) < math.inf]
+    if not 0 < values.get("stay_discount", 1.0) <= 1:
+        raise ValueError(f"plan.stay_discount must lie in (0, 1], got {values['stay_discount']}.")
+    wrong = [f"plan.{name}={values[name]}" for name in COST_FIELDS[2:] if not 0 <= values.get(name, 0.0) < math.inf]
     if wrong:
         raise ValueError(f"must be finite and not negative: {', '.join(wrong)}.")
     settings = {key: value for key, value in values.items() if key not in (*COST_FIELDS, "policy")}
@@ -371,7 +456,8 @@ def _rename_earlier(search: str, settings: dict[str, Any]) -> dict[str, Any]:
 
 def make_cost(plan: DictConfig, inverse_model: InverseDynamicsModel) -> nn.Module:
     """The cost of the ``plan`` group; further terms are weighted relative to the standard deviation of the first."""
-    terms, weights = [COSTS[plan.get("cost", "goal")]()], [1.0]
+    name = plan.get("cost", "goal")
+    terms, weights = [COSTS[name](*([plan.get("stay_discount", 0.3)] if name == "stay" else []))], [1.0]
     effort, consistency = plan.get("effort", 0.0), plan.get("consistency", 0.0)
     if effort:
         terms, weights = [*terms, ActionEffort()], [*weights, effort]

@@ -24,21 +24,9 @@ from omegaconf import DictConfig
 SCRIPTS = Path(__file__).resolve().parents[2] / "sota-implementations" / "ficreg"
 sys.path.insert(0, str(SCRIPTS))
 PLAN = ["plan.iterations=1", "plan.num_candidates=20", "plan.num_elites=5"]
-TINY = [
-    "env.data.episodes=20",
-    "model.image_size=32",
-    "model.conv_channels=[4,8,16]",
-    "model.predictor_width=16",
-    "model.predictor_depth=1",
-    "model.predictor_mlp_dim=16",
-    "model.inverse_hidden_dim=16",
-    "optim.epochs=1",
-    "optim.batch_size=32",
-    "collect.num_workers=0",
-    "evaluation.num_pairs=4",
-    "evaluation.record=2",
-    *PLAN,
-]
+TINY = ["model.image_size=32", "model.conv_channels=[4,8,16]", "model.predictor_width=16", "model.predictor_depth=1"]
+TINY += ["model.predictor_mlp_dim=16", "model.inverse_hidden_dim=16", "optim.epochs=1", "optim.batch_size=32"]
+TINY += ["env.data.episodes=20", "collect.num_workers=0", "evaluation.num_pairs=4", "evaluation.record=2", *PLAN]
 
 
 def with_tiny(script: str, overrides: tuple[str, ...], tiny: bool) -> list[str]:

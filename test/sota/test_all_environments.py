@@ -10,18 +10,11 @@ import pytest
 from torchrl_ficreg.envs._gl import gl_works
 
 ACTION_DIM = {"push_t": 2, "reacher": 2, "cube": 5}
-EPISODES, STEPS = 10, 20
-SHORT = [
-    f"env.data.episodes={EPISODES}",
-    f"env.data.max_steps={STEPS}",
-    "env.goal_offset=10",
-    "env.budget=11",
-    "plan.horizon=2",
-    "plan.receding_horizon=2",
-    "evaluation.num_pairs=2",
-    "evaluation.record=1",
-    "refine.steps=20",
-]
+EPISODES, STEPS = 10, 36
+SHORT = [f"env.data.episodes={EPISODES}", f"env.data.max_steps={STEPS}", "env.goal_offset=10", "env.budget=11"]
+SHORT += ["plan.horizon=2", "plan.receding_horizon=2", "evaluation.num_pairs=2", "evaluation.record=1"]
+SHORT += ["loss.prediction_steps=2", "refine.epochs=1", "refine.prediction_steps=3", "refine.batch_size=16"]
+SHORT += ["model.keypoint_channels=[4,8,8]"]
 
 
 @pytest.mark.parametrize("env", ACTION_DIM)

@@ -98,9 +98,11 @@ def test_the_papers_recipe_to_the_letter(train, env):
 
 
 def test_a_recipe_overrides_the_common_file(train):
-    """And is overridden on the command line. The paper's planning belongs to CEM alone."""
-    assert train("env=push_t").refine.steps == 3000
-    assert train("env=push_t", "refine.steps=0").refine.steps == 0
+    """And is overridden on the command line. The paper's planning belongs to CEM alone, and its pictures are the published."""
+    assert train("env=push_t").refine.epochs == 5
+    assert train("env=push_t", "refine.epochs=0").refine.epochs == 0
+    assert train("env=reacher").env.kwargs.detail == "fast"
+    assert train("env=reacher", "model=paper").env.kwargs.detail == "published"
     assert train("model=paper", "env=push_t", "plan=policy").plan.bounds == "environment"
 
 

@@ -83,19 +83,15 @@ def test_a_python_without_torch_and_an_unknown_option_are_refused(tmp_path):
 def test_a_slot_that_is_cut_short_leaves_a_report_and_no_process(tmp_path, how):
     process = begin("--work", str(tmp_path / "work"), "--out", str(tmp_path / "out"), "--dry-run")
     assert process.stdout.readline().startswith("two_room_lewm")  # the first run begins
-    (child,) = await_children(process.pid)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    await_true(children.read_text)
+    (child,) = children.read_text().split()
     process.send_signal(how)
     process.communicate(timeout=60)
     assert process.returncode == (75 if how == signal.SIGTERM else -how)
     report = json.loads((tmp_path / "out" / "ficreg_gpu.json").read_text())
     assert set(report["unfinished"]) == NAMES and len(report["slots"]) == 1
     await_true(lambda: not Path(f"/proc/{child}").exists())
-
-
-def await_children(pid: int) -> list[str]:
-    children = Path(f"/proc/{pid}/task/{pid}/children")
-    await_true(lambda: children.read_text())
-    return children.read_text().split()
 
 
 def await_true(claim) -> None:

@@ -10,10 +10,12 @@ from pathlib import Path
 import pytest
 import utils
 from omegaconf import OmegaConf
+from results import find_dataset
 
 from torchrl_ficreg import GoalPolicy, InverseDynamicsModel
+from torchrl_ficreg.evaluation import StartGoalPairs
 from torchrl_ficreg.modules.goal_policy import save_goal_policy
-from torchrl_ficreg.trainers import load_world_model
+from torchrl_ficreg.trainers import find_checkpoint, load_world_model
 
 RUN = "runs/two_room_cpu_ficreg_seed0"
 SMALL = {
@@ -62,20 +64,36 @@ def test_every_search_can_be_named(trained, evaluate, files, search):
     assert files(trained) == before
 
 
-@pytest.mark.parametrize("horizon", [1, 2])
-def test_it_may_plan_again_after_every_block(trained, evaluate, horizon):
-    """The outcome belongs to the settings: given again it is the same."""
-    overrides = ["plan.receding_horizon=1", f"plan.horizon={horizon}", "plan.iterations=1"]
-    first = evaluate(trained, *overrides)
-    assert first["plan"]["receding_horizon"] == 1 and first["plan"]["num_candidates"] == 20
-    second = evaluate(trained, *overrides, "num_envs=3")
-    assert second["policy"]["first_success_step"] == first["policy"]["first_success_step"]
-
-
-def test_every_cost_can_be_named(trained, evaluate):
-    results = evaluate(trained, "plan.cost=path", "plan.effort=0.1", "plan.consistency=0.1", "plan.iterations=1")
-    wanted = {"cost": "path", "effort": 0.1, "consistency": 0.1}
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        {"cost": "path", "effort": 0.1, "consistency": 0.1},
+        {"cost": "stay", "stay_discount": 0.5, "time_to_go": 2, "min_time_to_go": 1, "fallback": True, "receding_horizon": 1},
+    ],
+)
+def test_every_cost_can_be_named(trained, evaluate, wanted):
+    results = evaluate(trained, *(f"plan.{name}={value}" for name, value in wanted.items()), "plan.iterations=1")
     assert {name: results["plan"][name] for name in wanted} == wanted
+
+
+def test_settings_can_be_chosen_on_validation_pairs(trained, run, evaluate, tmp_path):
+    """As many as the frozen ones, of other episodes; without the dataset there are none."""
+    results = {pairs: evaluate(trained, "plan.iterations=1", f"pairs={pairs}") for pairs in ("null", "validation")}
+    hashes = {name: row["policy"]["pairs_hash"] for name, row in results.items()}
+    assert hashes["null"] != hashes["validation"] and results["validation"]["policy"]["pairs"] == 4
+    assert hashes["null"] == StartGoalPairs.load(trained / RUN / "pairs.json").hash
+    shutil.copytree(trained / "runs", tmp_path / "runs")
+    (line,) = run(tmp_path, "pairs=validation").stderr.splitlines()
+    assert line.startswith("error: ") and "two_room" in line
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_the_episodes_of_a_run_are_found_from_its_folder(copy, monkeypatch, tmp_path, moved):
+    """Wherever a command is started, also after run and episodes were moved together."""
+    settings = utils.settings_of_card(load_world_model(find_checkpoint(copy / RUN))[2])
+    folder = copy.rename(tmp_path / "moved") if moved else copy
+    monkeypatch.chdir(tmp_path)
+    assert find_dataset(settings, folder / RUN) == folder / utils.dataset_path(settings)
 
 
 def test_a_policy_plans_and_proposes(trained, run, evaluate, tmp_path):
@@ -98,13 +116,11 @@ def test_a_policy_plans_and_proposes(trained, run, evaluate, tmp_path):
         (["plan=dreamer"], r"plan=dreamer is unknown: choose one of \['cem', 'gradient', 'icem', 'mppi', 'policy'"),
         (["plan.search=dreamer"], "unknown plan.search 'dreamer': choose one of"),
         (["plan=icem", "plan.search=cem"], "plan.search=cem has no decay, kept_elites, .*: choose it by plan=cem"),
-        (["plan.cost=energy"], r"unknown plan.cost 'energy': choose one of \['goal', 'path'\]"),
+        (["plan.cost=energy"], r"unknown plan.cost 'energy': choose one of \['goal', 'path', 'stay'\]"),
+        (["plan.stay_discount=0"], r"plan.stay_discount must lie in \(0, 1\], got 0"),
         (["plan.effort=-1", "plan.consistency=-0.5"], "must be finite and not negative: plan.effort=-1, plan.consistency=-0.5"),
         (["plan.horizon=3", "plan.receding_horizon=1"], "plan.horizon=3 blocks of 5 steps reach .* 10 steps.* most 2"),
         (["plan.num_elites=21"], "num_elites must lie between 2 and num_candidates=20, got 21"),
-        (["plan.receding_horizon=3"], "receding_horizon must be at most horizon"),
-        (["plan.noise_beta=1"], "no field 'plan.noise_beta'"),
-        (["plan=icem", "plan.noise_beta=-1"], "noise_beta must not be negative"),
         (["plan=gradient", "plan.learning_rate=0"], "learning_rate must be positive"),
     ],
 )
@@ -129,15 +145,10 @@ def test_the_plan_of_a_run_made_before_settings_were_renamed_is_read(search, ear
     assert config.horizon == 4 and getattr(config, "stop_std", None) == stop_std
 
 
-def test_terms_without_weight_are_not_computed():
-    judge = InverseDynamicsModel(2, 2, 4)
-    plan = OmegaConf.create({"cost": "path", "effort": 0.0, "consistency": 0.0})
-    assert type(utils.make_cost(plan, judge)).__name__ == "PathDistance"
-    plan.effort = 0.3
-    cost = utils.make_cost(plan, judge)
-    assert [type(term).__name__ for term in cost.terms] == ["PathDistance", "ActionEffort"]
-    assert cost.weights == (1.0, 0.3) and cost.scale_free
-    plan.effort, plan.consistency = 0.0, 0.2
-    cost = utils.make_cost(plan, judge.train())
-    assert [type(term).__name__ for term in cost.terms] == ["PathDistance", "InverseConsistency"]
-    assert cost.weights == (1.0, 0.2) and not judge.training
+@pytest.mark.parametrize(("name", "term"), [("effort", "ActionEffort"), ("consistency", "InverseConsistency")])
+def test_terms_without_weight_are_not_computed(name, term):
+    judge, plan = InverseDynamicsModel(2, 2, 4), {"cost": "path", "effort": 0.0, "consistency": 0.0}
+    assert type(utils.make_cost(OmegaConf.create(plan), judge)).__name__ == "PathDistance"
+    cost = utils.make_cost(OmegaConf.create({**plan, name: 0.3}), judge.train())
+    assert [type(each).__name__ for each in cost.terms] == ["PathDistance", term] and cost.weights == (1.0, 0.3)
+    assert cost.scale_free and judge.training == (name == "effort")

@@ -51,6 +51,7 @@ PLDM = {
 # name: class, arguments, kind of the inverse model, which network receives gradient from which term
 COLLECTION = {
     "lewm": (LeWMLoss, {}, None, LEWM),
+    "lewm_two_steps": (LeWMLoss, {"prediction_steps": 2}, None, LEWM),
     "paper": (FICRegLoss, {}, "mlp", DETACHED),
     "live": (FICRegLoss, {"context": "live"}, "mlp", LIVE),
     "trusted": (FICRegLoss, {"consistency": "trusted"}, "mlp", DETACHED),

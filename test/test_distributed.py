@@ -195,27 +195,19 @@ def test_batch_norm_is_that_of_the_global_batch(ranks, single, sizes, kind, leng
         torch.testing.assert_close(ours, value, rtol=1e-10, atol=1e-12, msg=lambda text, name=name: f"{name}: {text}")
 
 
-@pytest.mark.parametrize("name", STEPS)
-def test_training_steps_are_those_of_one_process_on_the_whole_batch(ranks, single, name):
-    """Parameters, BatchNorm statistics and generator state agree to 1e-9, on all ranks."""
-    if ("step", name) not in ranks[0]:
+@pytest.mark.parametrize(("kind", "name"), [*(("step", name) for name in STEPS), *(("masked step", n) for n in MASKED_STEPS)])
+def test_training_steps_are_those_of_one_process_on_the_whole_batch(ranks, single, kind, name):
+    """Parameters, BatchNorm statistics and generator state agree to 1e-9, on all ranks.
+
+    Masks leave no transition at all on the first half of the ranks.
+    """
+    if (kind, name) not in ranks[0]:
         pytest.skip("on two processes only")
-    check_step(ranks, single, ("step", name))
-
-
-@pytest.mark.parametrize("name", MASKED_STEPS)
-def test_masks_may_leave_more_transitions_on_one_rank_than_on_another(ranks, single, name):
-    """Here none at all on the first half of the ranks: the steps are still those of one process."""
-    check_step(ranks, single, ("masked step", name))
-
-
-def check_step(ranks, single, key):
-    name, expected = key[1], single[key]
-    start = make_loss(name, dropout=0.0).to(DTYPE).state_dict()
+    expected, start = single[kind, name], make_loss(name, dropout=0.0).to(DTYPE).state_dict()
     moved = [key for key in expected if not start[key].equal(expected[key])]
     assert any(key.startswith("predictor_params") for key in moved)
     for rank in ranks:
-        for entry, value in rank[key].items():
+        for entry, value in rank[kind, name].items():
             assert value.shape == expected[entry].shape, entry
             assert value.allclose(expected[entry], rtol=1e-9, atol=1e-9), entry
 

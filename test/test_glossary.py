@@ -84,33 +84,24 @@ def test_no_text_uses_a_synonym(path):
 
 
 @pytest.mark.parametrize(
-    ("path", "content"),
+    ("path", "content", "count"),
     [
-        ("a.py", '"""The judge\'s error."""\n'),
-        ("a.py", "x = 1  # two judges\n"),
-        ("a.py", 'raise ValueError(f"consistency={x!r} needs a judge.")\n'),
-        ("a.yaml", "coeff: 1.0  # weight of the judge\n"),
-        ("a.rst", "Read by the\njudge twice.\n"),
-        ("a.md", "- a random\n  floor of 5 %\n"),
+        ("a.py", '"""The judge\'s error."""\n', 1),
+        ("a.py", "x = 1  # two judges\n", 1),
+        ("a.py", 'raise ValueError(f"consistency={x!r} needs a judge.")\n', 1),
+        ("a.yaml", "coeff: 1.0  # weight of the judge\n", 1),
+        ("a.rst", "Read by the\njudge twice.\n", 1),
+        ("a.md", "- a random\n  floor of 5 %\n", 1),
+        ("a.py", 'judge = out["judge_r2_real"] // math.floor(judge)\n', 0),
+        ("a.py", '"""Writes ``judge_trust``, consistency_target="judge", see :func:`judge_report`.\n\n>>> judge = 1\n"""\n', 0),
+        ("a.yaml", "target: judge  # action (the paper) | judge (what is recovered)\n", 0),
+        ("torchrl_ficreg/envs/cube/physics.py", "height = 0.02  # m, on the floor\n", 0),
+        ("a.rst", "``judge_r2_real`` and second moments, evenly spread; floor_ratio.\n", 0),
+        ("a.md", "consistency_target=judge\n", 0),
     ],
 )
-def test_a_synonym_is_found(path, content):
-    assert synonyms(path, content)
-
-
-@pytest.mark.parametrize(
-    ("path", "content"),
-    [
-        ("a.py", 'judge = out["judge_r2_real"] // math.floor(judge)\n'),
-        ("a.py", '"""Writes ``judge_trust``, consistency_target="judge", see :func:`judge_report`.\n\n>>> judge = 1\n"""\n'),
-        ("a.yaml", "target: judge  # action (the paper) | judge (what is recovered)\n"),
-        ("torchrl_ficreg/envs/cube/physics.py", "height = 0.02  # m, on the floor\n"),
-        ("a.rst", "``judge_r2_real`` and second moments, evenly spread; floor_ratio.\n"),
-        ("a.md", "consistency_target=judge\n"),
-    ],
-)
-def test_code_and_other_meanings_are_exempt(path, content):
-    assert synonyms(path, content) == []
+def test_a_synonym_is_found_and_code_and_other_meanings_are_exempt(path, content, count):
+    assert len(synonyms(path, content)) == count
 
 
 def test_the_glossary_has_an_entry_for_every_synonym():

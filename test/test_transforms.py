@@ -93,9 +93,6 @@ def make_buffer(steps, num_frames=4, frame_skip=5, clips=8, flat=False):
     return buffer
 
 
-# ---------------------------------------------------------------- on a replay buffer
-
-
 def test_clips_of_a_replay_buffer_are_those_of_our_own_dataset():
     """Same frames, same blocks, same z-scores, wherever the clip begins."""
     steps = steps_of([40, 30])
@@ -181,9 +178,6 @@ def test_unfit_batches_are_refused_in_one_line(settings, change, error, message)
     assert "\n" not in str(raised.value)
 
 
-# ---------------------------------------------------------------- on an environment
-
-
 @pytest.mark.parametrize("name", ENVS)
 @pytest.mark.parametrize("goal", [draw_goal, torch.zeros(3, 4, 4, dtype=torch.uint8)], ids=["drawn", "fixed"])
 def test_specs_are_right(name, goal):
@@ -247,9 +241,6 @@ def test_environments_that_do_not_fit_are_refused():
         env.step(env.reset().set("action", torch.zeros(2)))
 
 
-# ---------------------------------------------------------------- goals
-
-
 @pytest.mark.parametrize("name", [*ENVS, "in workers"])
 def test_a_goal_stays_until_the_reset_of_its_environment(name):
     if name == "in workers":
@@ -280,10 +271,9 @@ def test_a_fixed_goal_is_every_observations_and_every_samples():
     "goal", [torch.zeros(3, 5, 4, dtype=torch.uint8), torch.zeros(3, 4, 4), torch.zeros(4, dtype=torch.uint8)]
 )
 def test_goals_unlike_the_pixels_are_refused(goal):
-    with pytest.raises(ValueError, match=r"a goal must be a frame \[3, 4, 4\] of torch.uint8"):
-        TransformedEnv(Plane(), GoalImage(goal)).reset()
-    with pytest.raises(ValueError, match=r"a goal must be a frame \[3, 4, 4\] of torch.uint8"):
-        TransformedEnv(Plane(), GoalImage(lambda: goal)).reset()
+    for given in (goal, lambda: goal):
+        with pytest.raises(ValueError, match=r"a goal must be a frame \[3, 4, 4\] of torch.uint8"):
+            TransformedEnv(Plane(), GoalImage(given)).reset()
 
 
 def test_goals_need_pixels_and_a_reset():
@@ -306,9 +296,6 @@ def test_a_transform_that_would_change_a_sampled_goal_again_at_every_step_is_ref
         steps = TransformedEnv(Plane(), Compose(*[GoalImage(goal), cast][::order])).rollout(3)
         assert steps["goal_pixels"].dtype == torch.float32
         assert (steps["next", "goal_pixels"] == steps["goal_pixels"][0]).all()
-
-
-# ---------------------------------------------------------------- planning
 
 
 @pytest.mark.parametrize("name", ["single", "vectorised", "serial"])

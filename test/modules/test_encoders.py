@@ -151,7 +151,7 @@ def test_floats_can_be_normalized_under_a_transform_of_torch_func():
         (ConvEncoder, {"image_size": 18, "channels": (4, 8)}, "image_size 18 must be a multiple of 4"),
         (ViTEncoder, {"image_size": 20, "patch_size": 8}, "image_size 20 must be a multiple of patch_size 8"),
         (KeypointEncoder, {"image_size": 30}, "positive multiple of 4"),
-        (KeypointEncoder, {"channels": (8, 8)}, "three convolutions"),
+        (KeypointEncoder, {"channels": (8, 8)}, "three layers"),
     ],
 )
 def test_sizes_that_do_not_fit_are_refused(make, sizes, message):

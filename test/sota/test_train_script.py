@@ -200,7 +200,7 @@ def test_a_run_stopped_while_collecting_records_the_same_bytes_when_repeated(
     assert len(recorded) == 5  # three arrays, their index and the header
 
 
-@pytest.mark.parametrize("backend", ["tensorboard", "wandb"])
+@pytest.mark.parametrize("backend", ["tensorboard", pytest.param("wandb", marks=pytest.mark.slow)])
 def test_lewm_trains_and_other_loggers_work(beside, execute, spawn, backend):
     """The baseline has its own run folder on the same data and no term of FICReg; its logger's files are inside it."""
     pytest.importorskip(backend)

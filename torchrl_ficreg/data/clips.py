@@ -95,7 +95,11 @@ class ClipStorage(TensorStorage):
         self.num_frames, self.frame_skip = num_frames, frame_skip
         episodes = np.asarray(episodes, dtype=np.int64)
         if latent is not None:
-            self._latent, self._latent_row = _check_latents(latent, store, episodes)
+            length = store.length[episodes - 1]
+            check_latents(latent, length.sum(), "these episodes have")
+            self._latent = latent.detach().float().cpu().numpy()  # [N, D]
+            self._latent_row = np.zeros(len(store.length), dtype=np.int64)  # first row of each of these episodes
+            self._latent_row[episodes - 1] = np.cumsum(length) - length
         starts = store.length[episodes - 1] - clip_length(num_frames, frame_skip) + 1  # [E] legal starts of each
         self._episode = episodes[starts > 0]
         self._stop_clip = np.cumsum(starts[starts > 0])  # [E], one past the last clip number of each
@@ -213,17 +217,16 @@ class ClipStorage(TensorStorage):
         return state
 
 
-def _check_latents(latent: torch.Tensor, store: EpisodeStore, episodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Latents [N, D] and, for every episode of the store, the row of its first one (meaningless for other episodes)."""
-    length = store.length[episodes - 1]
-    if latent.ndim != 2 or len(latent) != length.sum():
+def check_latents(latent: torch.Tensor, num_frames: int, owner: str) -> None:
+    """Refuses latents that are not one vector [D] for each of so many frames.
+
+    Raises:
+        ValueError: they are not [num_frames, D].
+    """
+    if latent.ndim != 2 or len(latent) != num_frames:
         raise ValueError(
-            f"these episodes have {length.sum()} frames, got latents {list(latent.shape)}: encode the same split with "
-            "encode_episodes."
+            f"{owner} {num_frames} frames, got latents {list(latent.shape)}: encode the same split with encode_episodes."
         )
-    first = np.zeros(len(store.length), dtype=np.int64)
-    first[episodes - 1] = np.cumsum(length) - length
-    return latent.detach().float().cpu().numpy(), first
 
 
 def clip_length(num_frames: int, frame_skip: int) -> int:

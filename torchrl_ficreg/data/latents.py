@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 from tqdm import tqdm
 
+from torchrl_ficreg.data.clips import check_latents
 from torchrl_ficreg.data.dataset import OfflineTrajectories
 from torchrl_ficreg.keys import ACTION, GOAL_LATENT, LATENT, PIXELS
 
@@ -87,14 +88,6 @@ def _frames(dataset: OfflineTrajectories, batch_size: int) -> Iterator[torch.Ten
         yield torch.cat(waiting)
 
 
-def _check_latents(dataset: OfflineTrajectories, latent: torch.Tensor) -> None:
-    if latent.ndim != 2 or len(latent) != dataset.num_steps:
-        raise ValueError(
-            f"the {dataset.split!r} split has {dataset.num_steps} frames, got latents {list(latent.shape)}: encode "
-            "the same split with encode_episodes."
-        )
-
-
 def _actions_and_blocks(dataset: OfflineTrajectories) -> tuple[torch.Tensor, torch.Tensor]:
     """Z-scored actions [N, A] and the number of whole action blocks that follow each row, int64 [N]."""
     table = dataset.episodes
@@ -150,7 +143,7 @@ class GoalRows:
     def __init__(self, dataset: OfflineTrajectories, latent: torch.Tensor, *, max_blocks: int) -> None:
         if max_blocks < 1:
             raise ValueError(f"max_blocks must be positive, got {max_blocks}.")
-        _check_latents(dataset, latent)
+        check_latents(latent, dataset.num_steps, f"the {dataset.split!r} split has")
         self.frame_skip, self.latent = dataset.frame_skip, latent
         self.action, blocks = _actions_and_blocks(dataset)  # [N, A], [N]
         self.action = self.action.to(latent.device)
